@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, GenreError
 from genre_tasks.temporary_names import describe_owner, remove_abandoned, remove_path
+
+# Writing to a file that is open names no file in its error.
+_ERRORS_OF_OPEN_FILES = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Gives a temporary path beside ``path``; when the block ends, the file written there replaces ``path``.
 
-    After an error the old file is still there and the temporary one is gone. Two processes may write the same path.
+    After an error the old file is still there, the temporary one is gone, and the error names ``path``. Two
+    processes may write the same path.
 
     Args:
         path: the file to replace; its folder exists.
@@ -36,8 +41,22 @@ def atomic_path(path: Path) -> Iterator[Path]:
     try:
         yield part
         part.replace(path)
+    except (OSError, GenreError) as error:
+        _name_target(error, part, path)
+        raise
     finally:
-        part.unlink(missing_ok=True)
+        # A disk that may only be read refuses this too, which would hide the first error.
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _name_target(error: OSError | GenreError, part: Path, path: Path) -> None:
+    """Makes an error of the temporary file name the file that was asked for."""
+    if isinstance(error, GenreError):
+        if error.file == str(part):
+            error.file = str(path)
+    elif str(error.filename) == str(part) or (error.filename is None and error.errno in _ERRORS_OF_OPEN_FILES):
+        error.filename = str(path)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -37,7 +37,7 @@ _TRANSLATIONS = (
         frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG}),
         DiskFullError,
         "The disk is full, or a quota or file-size limit is reached ({name})",
-        "Free space there or choose another place with --store; finished stages are kept, nothing is half-written.",
+        "Free space there or {place}; finished stages are kept, nothing is half-written.",
     ),
     _Translation(
         frozenset({errno.ENOMEM, errno.EMFILE, errno.ENFILE}),
@@ -58,24 +58,27 @@ _TRANSLATIONS = (
         frozenset({errno.EACCES, errno.EPERM, errno.EROFS}),
         InputError,
         "Not permitted ({name})",
-        "Give this user read and write permission there, or choose another place with --store.",
+        "Give this user read and write permission there, or {place}.",
     ),
 )
 _OTHER = _Translation(
     frozenset(),
     InputError,
     "The file system refuses ({name}: {text})",
-    "Check that the path of the store is a folder that this user can write to.",
+    "Check that the path is a folder, or in one, where this user can read and write, or {place}.",
 )
 
 
-def as_genre_error(error: OSError, path: Path, address: Address | None = None) -> GenreError:
+def as_genre_error(
+    error: OSError, path: Path, address: Address | None = None, option: str | None = "--store"
+) -> GenreError:
     """Translates an ``OSError`` so that a flow knows whether to retry, and a person what to do.
 
     Args:
         error: what the operating system reported.
         path: the file or folder, for an error that names none.
         address: the artifact that was read or written, if any.
+        option: which option of the command names the place, for the remedy; ``None``: not known.
 
     Returns:
         ``DiskFullError`` for a full disk, quota or file-size limit; ``ResourceError`` for exhausted memory or
@@ -92,7 +95,8 @@ def as_genre_error(error: OSError, path: Path, address: Address | None = None) -
     # An OSError without a number, as some libraries raise it, falls through to the general case.
     translation = next((t for t in _TRANSLATIONS if error.errno in t.codes), _OTHER)
     problem = translation.problem.format(name=name, text=error.strerror or error)
-    return translation.kind(problem, remedy=translation.remedy, **where)  # type: ignore[arg-type]
+    place = "name another place" if option is None else f"choose another place with {option}"
+    return translation.kind(problem, remedy=translation.remedy.format(place=place), **where)  # type: ignore[arg-type]
 
 
 @contextmanager

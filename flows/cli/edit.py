@@ -59,6 +59,8 @@ def edit(
         raise ConfigError("there is nothing to edit", remedy=remedy)
     open_existing_store(store)
     record = write_edited_run(store, run, checked)
+    for warning in record["edited"]["warnings"]:
+        typer.echo(f"warning: {warning}")
     count = len(record["edited"]["edits"]["edits"])
     typer.echo(f"run {record['run']}: run {record['edited']['run']} with {count} edit{'s' if count != 1 else ''}")
     typer.echo(f"wrote {record['report']}")

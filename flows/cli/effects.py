@@ -70,6 +70,7 @@ def effects(
 
 def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
     """Writes the plan's files and its picture into the folder, over those of an earlier plan; their paths."""
+    from flows.output_errors import name_output
     from flows.plots.effects_plot import plot_effects_plan
     from genre_tasks.temporary_names import temporary_folder
     from storage.codecs import get_codec
@@ -78,7 +79,7 @@ def _write_plan(plan: EffectsPlan, folder: Path, title: str) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     # Everything is written beside the old files first, so that an error leaves the old ones as they were.
-    with temporary_folder(folder) as temporary:
+    with name_output(folder), temporary_folder(folder) as temporary:
         get_codec("effects").write(temporary, plan)
         write_png(temporary / "effects.png", plot_effects_plan(plan, title))
         # An earlier plan may have had masks, points or poses that this one lacks. Anything else is the user's.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import platform
 import sys
@@ -10,6 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +34,8 @@ _STATUS_BY_CODE: dict[int, Status] = {2: "refused", 129: "interrupted", 130: "in
 _ERRORS_WITHOUT_A_FILE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM, errno.EMFILE, errno.ENFILE})
 # PyTorch's allocator, the C library, and its loader of shared libraries, which Python reports as an ImportError.
 _OUT_OF_MEMORY_PHRASES = ("can't allocate memory", "annot allocate memory", "failed to map segment from shared object")
+# Of the options that name a place, those that many commands share.
+_PLACE_OPTIONS = frozenset({"--out", "--store"})
 _MAX_MESSAGE_LENGTH = 300
 
 
@@ -152,10 +156,24 @@ def _translate(error: BaseException) -> GenreError | None:
             "end other programs; finished stages are kept.",
         )
     if isinstance(error, OSError) and (error.filename is not None or error.errno in _ERRORS_WITHOUT_A_FILE):
-        known = as_genre_error(error, Path())
+        # Errors of the store are translated by itself: most of those that come here are of what a command writes.
+        file = None if error.filename is None else str(error.filename)
+        known = as_genre_error(error, Path(), option=None if file is None else _find_option(file))
         # The path above stands for none: not every library names the file.
-        known.file = None if error.filename is None else str(error.filename)
+        known.file = file
         return known
+    return None
+
+
+def _find_option(file: str) -> str | None:
+    """The option of the command line that names the file or a folder that it is in; ``None`` where no such one does."""
+    words = [part for word in sys.argv[1:] for part in (word.split("=", 1) if word.startswith("--") else (word,))]
+    # There may be no working folder any more, and no home folder of a user.
+    with suppress(OSError, RuntimeError):
+        place = Path(file).absolute()
+        for option, value in itertools.pairwise(words):
+            if option in _PLACE_OPTIONS and Path(value).expanduser().absolute() in (place, *place.parents):
+                return option
     return None
 
 

@@ -8,6 +8,8 @@ from typing import Any, Protocol
 
 from flows.dataset.work_units import WorkUnit
 
+DATASET_TAG = "genre-dataset:"
+"""How the tag begins that all flow runs of one dataset have, its parents among them."""
 SILENT = "SILENT"
 """The server missed heartbeats of a run and calls it Crashed; by its heartbeats it may live nevertheless."""
 ACTIVE_STATES = frozenset({"SCHEDULED", "PENDING", "RUNNING", "PAUSED", "CANCELLING", SILENT})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from prefect import flow
@@ -15,9 +16,9 @@ from flows.dataset.dataset_record import name_dataset, write_dataset_record
 from flows.dataset.live_table import FINAL_STATUSES, LiveTable
 from flows.dataset.prefect_runs import ChildRequest, PrefectRuns
 from flows.dataset.server_calls import call_server, read_last_outage
-from flows.dataset.submission import mark_as_parent
-from flows.dataset.supervisor import Supervisor, read_limits
-from flows.dataset.work_units import Unit, list_units
+from flows.dataset.submission import mark_as_parent, require_parent
+from flows.dataset.supervisor import SupervisionLimits, Supervisor, read_limits
+from flows.dataset.work_units import Unit, WorkUnit, list_units
 from flows.defaults import DEFAULT_ATTEMPTS, DEFAULT_IN_FLIGHT, DEFAULT_PRESET, DEFAULT_STORE
 from flows.pipeline.log_cache import expand_logs
 from flows.pipeline.progress import get_reporter
@@ -65,6 +66,7 @@ def reconstruct_dataset(
     Raises:
         InputError: a star matches no folder.
         ConfigError: a setting, a parameter or a variable of the environment is wrong.
+        ResourceError: with a pool, its own flow run was deleted while it ran.
         LogsFailedError: some logs are not complete, raised once all were tried; its ``outcomes`` has all of them.
 
     Example::
@@ -85,8 +87,7 @@ def reconstruct_dataset(
         parameters = {"preset": preset, "store": store, "settings": settings}
         mark_as_parent(str(flow_run.id), name)
         request = ChildRequest(name, str(flow_run.id), pool, parameters, gpu_limit)
-        limits = read_limits(in_flight, attempts)
-        outcomes = Supervisor(units, PrefectRuns(request), limits, table.show, last_outage=read_last_outage).run()
+        outcomes = _reconstruct_on_pool(request, units, read_limits(in_flight, attempts), table)
     _report(outcomes)
     report = write_dataset_record(store, name, preset, outcomes)
     get_reporter().message(f"report {report}")
@@ -104,6 +105,14 @@ def _check_parameters(in_flight: int, unit: str, attempts: int) -> None:
             raise ConfigError(f"{name} is {value!r}", remedy=f"{name} is a whole number from 1 on.")
     if unit not in ("log", "chunk"):
         raise ConfigError(f"unit is {unit!r}", remedy="unit is log or chunk.")
+
+
+def _reconstruct_on_pool(
+    request: ChildRequest, units: Sequence[WorkUnit], limits: SupervisionLimits, table: LiveTable
+) -> Outcomes:
+    # A parent that was deleted must not submit: another one may have taken its place.
+    runs = PrefectRuns(request, before_submission=partial(require_parent, request.parent))
+    return Supervisor(units, runs, limits, table.show, last_outage=read_last_outage).run()
 
 
 def _reconstruct_here(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -30,7 +30,8 @@ from prefect.client.schemas.sorting import FlowRunSort
 from prefect.events.filters import EventFilter, EventNameFilter, EventOccurredFilter, EventOrder, EventResourceFilter
 from prefect.states import Crashed
 
-from flows.dataset.child_runs import ACTIVE_STATES, SILENT, ChildRun
+from flows.dataset.child_runs import ACTIVE_STATES, DATASET_TAG, SILENT, ChildRun
+from flows.dataset.child_start_watch import ChildStartWatch
 from flows.dataset.server_calls import call_server
 from flows.dataset.supervisor import HEARTBEAT_S
 from flows.dataset.work_units import WorkUnit, read_unit
@@ -77,12 +78,20 @@ class PrefectRuns:
     Args:
         request: what the child runs have in common.
         client: of the server; the one of the settings if not given.
+        before_submission: called before runs are submitted; what it raises ends the dataset.
     """
 
-    def __init__(self, request: ChildRequest, client: SyncPrefectClient | None = None) -> None:
+    def __init__(
+        self,
+        request: ChildRequest,
+        client: SyncPrefectClient | None = None,
+        before_submission: Callable[[], None] = lambda: None,
+    ) -> None:
         self._request = request
         self._client = client or get_client(sync_client=True)
+        self._before_submission = before_submission
         self._deployment = call_server(self._client.read_deployment_by_name, DEPLOYMENT)
+        self._start_watch = ChildStartWatch(self._client)
 
     def find(self) -> list[ChildRun]:
         """Finds runs of an earlier life of this parent, and active ones of any parent of the same dataset."""
@@ -92,6 +101,7 @@ class PrefectRuns:
 
     def submit(self, requests: Sequence[tuple[WorkUnit, int]]) -> Sequence[ChildRun]:
         """Submits runs, several at a time; the same unit and attempt give the same run."""
+        self._before_submission()
         # One after another, a busy server that takes a second for a request would leave a hundred workers idle.
         with ThreadPoolExecutor(_SUBMITTED_AT_ONCE) as threads:
             return list(threads.map(self._submit, *zip(*requests, strict=True)))
@@ -119,11 +129,11 @@ class PrefectRuns:
 
     def read(self, ids: Sequence[str]) -> Mapping[str, ChildRun]:
         """Reads the state of runs."""
-        found: dict[str, ChildRun] = {}
+        runs: list[FlowRun] = []
         for some in _split(ids, _RUNS_PER_REQUEST):
-            for run in self._page(FlowRunFilter(id=FlowRunFilterId(any_=[UUID(id_) for id_ in some]))):
-                found[str(run.id)] = self._read(run)
-        return found
+            runs += self._page(FlowRunFilter(id=FlowRunFilterId(any_=[UUID(id_) for id_ in some])))
+        self._start_watch.check(runs)
+        return {str(run.id): self._read(run) for run in runs}
 
     def read_heartbeats(self, ids: Sequence[str]) -> Mapping[str, str]:
         """Reads when runs have last shown that they are alive."""
@@ -246,7 +256,7 @@ def dataset_tag(dataset: str) -> str:
     >>> dataset_tag("0b2a")
     'genre-dataset:0b2a'
     """
-    return f"genre-dataset:{dataset}"
+    return f"{DATASET_TAG}{dataset}"
 
 
 def has_heartbeat(client: SyncPrefectClient, run_id: str, since_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""Says what is missing where a dataset's flow run waits long for its worker."""
+"""Says what is missing where a flow run of a dataset waits long for its worker."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from collections.abc import Callable
 from uuid import UUID
 
 from prefect.client.orchestration import SyncPrefectClient
-from prefect.client.schemas.objects import FlowRun, StateType, WorkQueueStatus
+from prefect.client.schemas.objects import FlowRun, StateType, WorkQueue, WorkQueueStatus
+from prefect.exceptions import ObjectNotFound
 
 from flows.dataset.server_calls import call_server
 
@@ -18,18 +19,30 @@ _PATIENCE_S = 90.0
 
 
 class StartWatch:
-    """Warns where a followed flow run is not started, and again where another reason shows.
+    """Warns where a watched flow run is not started, and again where another reason shows.
 
     Args:
         client: of the server.
         clock: seconds of a clock that never jumps.
+        subject: what a warning calls the flow run.
     """
 
-    def __init__(self, client: SyncPrefectClient, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        client: SyncPrefectClient,
+        clock: Callable[[], float] = time.monotonic,
+        subject: str = "the dataset's flow run",
+    ) -> None:
         self._client = client
         self._clock = clock
+        self._subject = subject
         self._state_id: UUID | None = None
         self._since_s = clock()
+        self._last_reason = ""
+
+    def restart(self) -> None:
+        """Counts the next wait from its first check on, and warns of it again."""
+        self._state_id = None
         self._last_reason = ""
 
     def check(self, run: FlowRun) -> None:
@@ -51,15 +64,15 @@ class StartWatch:
         reason = self._find_reason(run)
         if reason != self._last_reason:
             self._last_reason = reason
-            _log.warning("the dataset's flow run has not started: %s", reason)
+            _log.warning("%s has not started: %s", self._subject, reason)
 
     def _find_reason(self, run: FlowRun) -> str:
         again = f"cancel it (prefect flow-run cancel {run.id}), and run the same command again."
         if run.state is not None and run.state.type is StateType.PENDING:
             return f"a worker has taken it, and starts no process. If that worker is dead, {again}"
-        if run.work_queue_id is None:
+        queue = self._read_queue(run)
+        if queue is None:
             return f"its work queue was deleted. Deploy the flows (genre ops deploy --store STORE), {again}"
-        queue = call_server(self._client.read_work_queue, run.work_queue_id)
         pool = queue.work_pool_name
         where = f"the work queue '{queue.name}' of the pool '{pool}'"
         if queue.status is WorkQueueStatus.NOT_READY:
@@ -70,3 +83,12 @@ class StartWatch:
         if queue.status is WorkQueueStatus.PAUSED:
             return f"{where} is paused. Resume it: prefect work-queue resume {queue.name} --pool {pool}."
         return f"{where} has a worker, and no free slot. Raise its limit, resume its pool, or wait for other runs."
+
+    def _read_queue(self, run: FlowRun) -> WorkQueue | None:
+        if run.work_queue_id is None:
+            return None
+        try:
+            return call_server(self._client.read_work_queue, run.work_queue_id)
+        except ObjectNotFound:
+            # Deleted since the run was read, which must not end who only watches.
+            return None

@@ -24,8 +24,9 @@ from prefect.client.schemas.objects import FlowRun, StateType
 from prefect.client.schemas.responses import DeploymentResponse
 from prefect.client.schemas.sorting import FlowRunSort
 from prefect.exceptions import ObjectNotFound
-from prefect.states import Crashed
+from prefect.states import Cancelled, Crashed
 
+from flows.dataset.child_start_watch import ChildStartWatch
 from flows.dataset.event_probe import EventProbe
 from flows.dataset.live_table import TABLE_KEY
 from flows.dataset.prefect_runs import DEPLOYMENT, count_heartbeats, dataset_tag, has_heartbeat, is_called_silent
@@ -107,6 +108,24 @@ def mark_as_parent(run_id: str, name: str) -> None:
             call_server(client.update_flow_run, UUID(run_id), tags=sorted(tags))
 
 
+def require_parent(run_id: str) -> None:
+    """Ends a parent whose flow run was deleted: it would go on to submit runs, next to those of a new parent.
+
+    Prefect stops a process whose flow run is cancelled, and leaves one alone whose flow run is deleted.
+
+    Args:
+        run_id: of the parent's flow run.
+
+    Raises:
+        ResourceError: the flow run was deleted.
+    """
+    with get_client(sync_client=True) as client:
+        try:
+            call_server(client.read_flow_run, UUID(run_id))
+        except ObjectNotFound as error:
+            raise _describe_deleted(run_id, "while it ran") from error
+
+
 def follow_dataset(
     run_id: UUID, show: Callable[[Sequence[Mapping[str, Any]]], None], poll_s: float = 2.0
 ) -> tuple[str, list[dict[str, Any]]]:
@@ -127,10 +146,12 @@ def follow_dataset(
         try:
             return _follow(client, run_id, show, poll_s)
         except ObjectNotFound as error:
-            raise ResourceError(
-                f"the dataset's flow run {run_id} was deleted while it was followed",
-                remedy="Run the same command again: it takes over the runs of logs that go on.",
-            ) from error
+            raise _describe_deleted(str(run_id), "while it was followed") from error
+
+
+def _describe_deleted(run_id: str, moment: str) -> ResourceError:
+    problem = f"the dataset's flow run {run_id} was deleted {moment}"
+    return ResourceError(problem, remedy="Run the same command again: it takes over the runs of logs that go on.")
 
 
 def _follow(
@@ -138,16 +159,16 @@ def _follow(
 ) -> tuple[str, list[dict[str, Any]]]:
     watch = HeartbeatWatch(client, run_id)
     start_watch = StartWatch(client)
+    child_watch = ChildStartWatch(client)
     while True:
         run = call_server(client.read_flow_run, run_id)
         start_watch.check(run)
+        child_watch.follow(run)
         if run.state is not None and run.state.type in (StateType.SCHEDULED, StateType.PENDING):
             # A run that waits for its worker sends no heartbeats yet.
             watch.restart()
         is_silent = watch.is_silent()
-        if run.state is not None and run.state.type is StateType.RUNNING and is_silent:
-            # Nobody else notices that the parent's worker died with all its processes.
-            crash_run(client, run.id)
+        if is_silent and _end_silent(client, run):
             continue
         rows = _read_table(client, run_id)
         show(rows)
@@ -155,6 +176,18 @@ def _follow(
         if run.state is not None and run.state.is_final() and not lives:
             return f"{run.state.type.value}: {run.state.message or ''}", _read_table(client, run_id)
         time.sleep(poll_s)
+
+
+def _end_silent(client: SyncPrefectClient, run: FlowRun) -> bool:
+    """Ends a parent that should send heartbeats; nobody else notices that its worker died with all its processes."""
+    state = None if run.state is None else run.state.type
+    if state is StateType.RUNNING:
+        crash_run(client, run.id)
+    elif state is StateType.CANCELLING:
+        message = f"the flow run {run.id} sends no heartbeat while it is being cancelled"
+        _log.warning("%s: it is set to Cancelled", message)
+        call_server(client.set_flow_run_state, run.id, Cancelled(message=message), force=True)
+    return state in (StateType.RUNNING, StateType.CANCELLING)
 
 
 def _find_deployment(client: SyncPrefectClient, name: str) -> DeploymentResponse:

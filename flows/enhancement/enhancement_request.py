@@ -23,6 +23,9 @@ ASSUMED_HEIGHT_M = 1.6
 
 _FORMATS_WITH_AXES = frozenset({"spz", "glb", "usdz"})
 _SHORT_CHUNK_SOURCE_EVERY = 2
+# Moved poses would not be those that the scene was fitted to, and points of its own depth cannot tell that recorded
+# ones err. Blur and view-dependent colours are those of the file, whatever the images call for.
+_UNCHANGED_EFFECTS = ("effects.pose_refinement=off", "effects.anti_aliasing=off", "effects.view_dependent_colour=off")
 
 
 @dataclass(frozen=True)
@@ -135,6 +138,7 @@ def prepare_enhancement(inputs: EnhancementInputs, config: PipelineConfig) -> En
         explanation.append(f"a unit is {scale:g} m, as asked for")
     depth = "the LiDAR's" if inputs.lidar else "the scene's own, where views agree: there is no LiDAR"
     explanation.append(f"depth is {depth}")
+    explanation.append("the scene was fitted to these poses, which are refined only with effects.pose_refinement=on")
     # Written with the numbers that were found, so that the log stays the same when finding changes.
     uri = format_uri(inputs.cameras, inputs.images, log.up.vector, scale)
     # Opened again, because its numbers are those of the URI: scene and images must be placed by the same ones.
@@ -188,6 +192,7 @@ def _make_settings(inputs: EnhancementInputs, log: PosedImagesLog, ingest: Inges
         f"initial.placement={placement}",
         # The scene is another program's work, and starts ENet as it is.
         "gnet.method=none",
+        *_UNCHANGED_EFFECTS,
     ]
     # A handful of images would have one source frame, and nothing between two of them to compare with.
     if frames <= 2 * ingest.source_every:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from flows.exchange.export_request import ExportRequest
 from flows.exchange.exporters import load_exporter
 from flows.exchange.stored_scenes import open_stored_scenes
+from flows.output_errors import name_output
 from genre_tasks.atomic_path import holds_files, replace_folder
-from genre_tasks.errors import ConfigError, InputError, ResourceError
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.exchange.file_digests import is_edited
 from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
 from genre_tasks.progress import Progress, silent
-from genre_tasks.temporary_names import describe_owner, temporary_folder
+from genre_tasks.temporary_names import temporary_folder
 from storage.files import digest_file, make_folders, payload_files, sync
-from storage.io_errors import as_genre_error
 
 _FOLDER_MODE = 0o755
 _LISTED_FILES = 5
-_REMEDY = "Free space, or name another --out in which this user may write; nothing is half-written."
 
 
 def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[str, Any]:
@@ -47,7 +46,7 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
     _check_folder(request.out, request.overwrite)
     held_files = holds_files(request.out)
     scenes = open_stored_scenes(request.store, request.scene, request.stage, request.chunks)
-    with _name_target(request.out):
+    with name_output(request.out):
         make_folders(request.out.parent)
         # In the same folder, because a rename is atomic only within one file system.
         with temporary_folder(request.out.parent) as folder:
@@ -63,22 +62,6 @@ def export_scenes(request: ExportRequest, progress: Progress = silent) -> dict[s
     return {"out": str(request.out), "format": request.format, "source": scenes.describe(), **written}
 
 
-@contextmanager
-def _name_target(out: Path) -> Iterator[None]:
-    """Makes errors of the disk name the folder that the user asked for, and not the hidden one that is written."""
-    try:
-        yield
-    except OSError as error:
-        known = as_genre_error(error, out)
-        # Only what is hidden has this in its name; a folder above, which cannot be made, is named as it is.
-        if describe_owner() in str(known.file):
-            known.file = str(out)
-        # Of memory and file handles another folder has no more.
-        if type(known) is not ResourceError:
-            known.remedy = _REMEDY
-        raise known from error
-
-
 def _check_folder(folder: Path, overwrite: bool) -> None:
     if not holds_files(folder):
         return
@@ -87,21 +70,28 @@ def _check_folder(folder: Path, overwrite: bool) -> None:
     if not (folder / SCENE_FILE).is_file():
         raise foreign
     try:
-        digests = {entry.path: entry.sha256 for entry in read_document(folder).files}
+        document = read_document(folder)
     except InputError as error:
         raise foreign from error
+    digests = {entry.path: entry.sha256 for entry in document.files}
     if any(name not in digests and name != SCENE_FILE for name, _ in payload_files(folder)):
         raise foreign
     if not overwrite:
         raise ConfigError(
             "--out holds an export already", remedy="Name another folder, or replace it by --overwrite.", file=folder
         )
+    scene_file = folder / SCENE_FILE
     changed = _find_changed_files(folder, digests)
+    # Names and classes of actors are edited in it, which an import takes.
+    if scene_file.is_symlink() or is_edited(scene_file, document.document_sha256):
+        changed.insert(0, SCENE_FILE)
     if changed:
         more = f" and {len(changed) - _LISTED_FILES} more" if len(changed) > _LISTED_FILES else ""
         listed = ", ".join(changed[:_LISTED_FILES]) + more
         problem = f"--overwrite would lose what was changed after the export: {listed}"
-        raise InputError(problem, remedy="Move these files, or name another folder.", file=folder)
+        # Without its document the folder would be no export.
+        movable = "the folder" if SCENE_FILE in changed else "these files"
+        raise InputError(problem, remedy=f"Move {movable} away, or name another folder.", file=folder)
 
 
 def _find_changed_files(folder: Path, digests: Mapping[str, str]) -> list[str]:

@@ -88,8 +88,12 @@ class FileExporter:
                 continue
             if request.per_actor:
                 scene = replace(scene, nodes=tuple(node for node in scene.nodes if node.motion is not None))
+            losses_of_chunk = tuple(dict.fromkeys(self._list_losses(scene, layout)))
             entry = describe_chunk(number, scene, scenes.describe_chunk(number))
-            for loss in dict.fromkeys(self._list_losses(scene, layout)):
+            if not self._format.carries_nodes:
+                # Files of clouds keep no list of losses: an import finds in the document what they have rounded or cut.
+                entry = entry.model_copy(update={"losses": losses_of_chunk})
+            for loss in losses_of_chunk:
                 chunks_by_loss.setdefault(loss, []).append(number)
             for part in _split_scene(number, scene, layout, request.frame):
                 progress(k, len(numbers), part.name)

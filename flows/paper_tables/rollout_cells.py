@@ -65,7 +65,7 @@ def measure_rollout_cell(
 
 
 def describe_rollouts(rows: Iterable[RolloutRow]) -> tuple[str, ...]:
-    """Says which rollouts of a log are nearer or weaker than the paper's, and which run into an actor.
+    """Says which rollouts are nearer or weaker than the paper's, which run into an actor, and what was not checked.
 
     Args:
         rows: of one log and method.
@@ -81,7 +81,10 @@ def describe_rollouts(rows: Iterable[RolloutRow]) -> tuple[str, ...]:
         if row.strength < 1:
             remarks.append(f"{name} at strength {row.strength:g}, as there is no room for more")
         remarks += [f"{name}: {collision}" for collision in row.collisions]
-    return tuple(remarks)
+        if not row.has_boxes:
+            remarks.append(f"the boxes of {row.log} cannot be read: no path was checked against parked vehicles")
+    # What holds for a log is said once.
+    return tuple(dict.fromkeys(remarks))
 
 
 def predict_rollouts(basis: Basis, layout: Layout, method: Method, places: Sequence[LogChunk]) -> dict[str, Any]:

@@ -17,7 +17,9 @@ from flows.training.training_scenes import get_or_make
 from genre_tasks.config import EvaluateConfig, PipelineConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.recorded_path import join_recorded_path
-from genre_tasks.ego_paths.world_actors import list_parked_actors, list_world_actors
+from genre_tasks.ego_paths.world_actors import WorldActor, list_parked_actors, list_world_actors
+from genre_tasks.errors import InputError
+from genre_tasks.logs.types import DrivingLog
 from genre_tasks.logs.vehicle_center import find_center_ahead
 from genre_tasks.metrics.network_files import NETWORK_ARGUMENTS, find_network_files
 from genre_tasks.rollout.handover import plan_handovers
@@ -32,6 +34,7 @@ from genre_tasks.rollout.rollout_scores import (
     score_rollout,
     use_global_shutter,
 )
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.novel_views import FixedViews
 from storage.address import Address
 from storage.code_digest import code_digest
@@ -62,6 +65,8 @@ class RolloutRow:
         metrics: ``psnr``, ``ssim`` and ``perceptual`` over views with a truth, ``kernel``, ``frechet`` and ``fid`` of
             all images; ``NAME/n`` images, and ``NAME/low``, ``NAME/high`` of 95 % intervals.
         collisions: overlaps with actors, a sentence each.
+        has_boxes: whether the log's boxes could be read. Without them parked vehicles are not known, and the path was
+            not checked against them.
         scores: everything that was measured, for paired comparisons.
     """
 
@@ -74,6 +79,7 @@ class RolloutRow:
     poses: int
     metrics: Mapping[str, float]
     collisions: tuple[str, ...] = ()
+    has_boxes: bool = True
     scores: RolloutScores | None = field(default=None, compare=False, repr=False)
 
 
@@ -140,7 +146,9 @@ class LogMeasurement:
         self.recorded = join_recorded_path(chunks)
         self.rig = use_global_shutter(estimate_rig(chunks))
         self._first = chunks[0]
-        self._actors = (*list_world_actors(chunks), *list_parked_actors(self._log.tracks(), chunks))
+        parked = _list_parked(self._log, chunks)
+        self._has_boxes = parked is not None
+        self._actors = (*list_world_actors(chunks), *(parked or ()))
         self._scene_digests = [[found[s].payload_digest for s in ("ingest", "effects", end)] for found in refs]
 
     def measure(self, method: str, rollout: TableRollout, true_views: int = TRUE_VIEWS) -> RolloutRow:
@@ -167,6 +175,7 @@ class LogMeasurement:
             poses=len(self._select_poses(planned)),
             metrics=_name_metrics(scores),
             collisions=planned.collisions,
+            has_boxes=self._has_boxes,
             scores=scores,
         )
 
@@ -236,6 +245,15 @@ class LogMeasurement:
 
     def _address(self, stage: str, key: str) -> Address:
         return Address(self._log.dataset, self._log.name, self._first.index, stage, key)
+
+
+def _list_parked(log: DrivingLog, chunks: Sequence[Chunk]) -> tuple[WorldActor, ...] | None:
+    """The parked vehicles of a log; ``None`` where its boxes cannot be read, without which its scenes were made too."""
+    try:
+        tracks = log.tracks()
+    except InputError:
+        return None
+    return list_parked_actors(tracks, chunks)
 
 
 def _name_metrics(scores: RolloutScores) -> dict[str, float]:

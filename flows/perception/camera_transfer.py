@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from genre_tasks.config import IngestConfig
 from genre_tasks.detection.agreement import Agreement, ImageMatches, match_image, summarise_matches
 from genre_tasks.detection.coco_classes import find_road_users
 from genre_tasks.errors import InputError
+from genre_tasks.logs.log_selection import choose_working_size
+from genre_tasks.logs.types import Camera
 from genre_tasks.scene.chunk import Chunk, View
 from genre_tasks.scene.image_decoding import decode_image
 from genre_tasks.scene.transforms import invert_se3
@@ -20,8 +23,11 @@ from storage.codecs.png import to_pixels
 if TYPE_CHECKING:
     from genre_tasks.detection.detections import Detections
     from genre_tasks.detection.detector import Detector
-    from genre_tasks.logs.types import DrivingLog
+    from genre_tasks.logs.types import DrivingLog, Lens
     from genre_tasks.scene.graph import SceneGraph
+
+# As in log_selection: sizes that differ by less are of one shape.
+_MAX_SHAPE_ERROR = 0.02
 
 
 @dataclass(frozen=True)
@@ -63,12 +69,33 @@ class DetectionPairs:
         return [match_image(real, simulated, self.classes, of_masks=of_masks) for real, simulated in pairs]
 
 
+def choose_image_size(lens: Lens, chunk: Chunk) -> tuple[int, int]:
+    """Chooses the size at which a camera is compared that a chunk was made without.
+
+    Args:
+        lens: of the camera, at the native resolution.
+        chunk: whose working resolution is meant.
+
+    Returns:
+        Width and height in pixels: the chunk's where the camera has its shape. Another camera has about as many pixels
+        in its own shape, since squeezed road users are not what detectors know.
+    """
+    shape = lens.width_px / lens.height_px
+    chunk_shape = chunk.width_px / chunk.height_px
+    # The chunk's sides are rounded to even numbers, which small images show.
+    rounding = 1 / chunk.width_px + 1 / chunk.height_px
+    if abs(shape / chunk_shape - 1) < _MAX_SHAPE_ERROR + rounding:
+        return chunk.width_px, chunk.height_px
+    config = IngestConfig().model_copy(update={"width_px": chunk.width_px, "height_px": chunk.height_px})
+    return choose_working_size(config, [Camera("", lens)])
+
+
 def list_camera_views(log: DrivingLog, chunk: Chunk, camera: str) -> tuple[View, ...]:
     """Lists the views of a camera that a chunk was made without.
 
     Args:
         log: of the chunk.
-        chunk: whose frames and working resolution.
+        chunk: whose frames; its working resolution, in the camera's own shape.
         camera: name of any camera of the log.
 
     Returns:
@@ -79,7 +106,8 @@ def list_camera_views(log: DrivingLog, chunk: Chunk, camera: str) -> tuple[View,
     """
     chunk_SE3_world = invert_se3(chunk.world_SE3_chunk)
     # At the working resolution, which renders have, too.
-    lens = next(c.lens for c in log.cameras if c.name == camera).resized(chunk.width_px, chunk.height_px)
+    lens = next(c.lens for c in log.cameras if c.name == camera)
+    lens = lens.resized(*choose_image_size(lens, chunk))
     views = []
     for frame in chunk.frames:
         image = log.image_bytes(camera, frame)

@@ -12,6 +12,7 @@ from flows.pipeline.definition import PIPELINE, StageSpec, find_scene_modules, f
 from flows.pipeline.log_cache import cached_log, select_chunks
 from flows.pipeline.memory_plan import estimate_chunk_size
 from flows.pipeline.stage_runner import Job
+from flows.preflight.effect_checks import check_effects
 from flows.preflight.machine_checks import assess_disk, assess_memory, estimate_disk_mib
 from flows.preflight.store_checks import check_store
 from genre_tasks.config import LPIPS_NETWORKS, PipelineConfig
@@ -91,7 +92,8 @@ def check_requirements(
 
     Raises:
         InputError: the log, a chunk, a file or weights are missing or unreadable, or the store cannot be written to.
-        ConfigError: a camera is unknown, a package is not installed, or the store is no folder.
+        ConfigError: a camera is unknown, a package is not installed, the store is no folder, or other settings leave
+            out an effect that is set on.
         ResourceError: the disk is full, or the limit that is set on memory is too low.
 
     >>> from flows.configuration import load_configuration
@@ -99,6 +101,7 @@ def check_requirements(
     >>> report.checked[0]
     'log synthetic:street?seed=1000: 20 frames'
     """
+    check_effects(config)
     inputs = check_inputs(log, chunks, config)
     files = check_files(config, stages)
     root = check_store(store, (inputs.log.dataset, inputs.log.name))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
 from flows.machine.facts import describe_environment
 from flows.machine.resource_usage import measure_usage
@@ -18,6 +18,7 @@ from flows.reconstruction.run_records import (
     write_run_record,
 )
 from flows.reconstruction.stored_values import find_last_stage, read_stage_value
+from flows.simulation.parked_actors import warn_of_standing_actors
 from flows.simulation.recorded_settings import read_recorded_edits, read_simulate_config
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config.simulation_sections import SimulateConfig
@@ -27,15 +28,13 @@ from genre_tasks.scene.reconstruction import Reconstruction
 from genre_tasks.scene_edits.actor_library import ActorLibrary
 from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.scene_edits.edits import Edit, EditList, Insert
+from genre_tasks.scene_edits.stored_chunk import prepare_stored_chunk
 from storage.address import Address
 from storage.code_digest import code_digest
 from storage.opening import open_store
 from storage.store import Artifact, Provenance
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-_CODE = "genre_tasks.scene_edits.edited_scenes"
+_CODE = ("genre_tasks.scene_edits.edited_scenes", ("genre_tasks.scene_edits.stored_chunk",))
 
 
 @dataclass(frozen=True)
@@ -157,7 +156,7 @@ def digest_edits(store: str, recorded: RunScenes, edits: EditList, config: Simul
         "inputs": recorded.payload_digests(),
         "runs": {name: RunScenes(store, name).record["run"] for name in runs},
         "contact_shadow": config.contact_shadow,
-        "code": code_digest(_CODE),
+        "code": code_digest(*_CODE),
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
@@ -172,8 +171,8 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         config: of re-simulation; ``None``: the run's.
 
     Returns:
-        The new run's record, with ``edited``: the recorded run and all edits. It lacks the chunks that the recorded
-        run lacks, and has its budget.
+        The new run's record, with ``edited``: the recorded run, all edits, and warnings of what they leave as it was.
+        It lacks the chunks that the recorded run lacks, and has its budget.
 
     Raises:
         InputError: there is no such run or actor, or an artifact is gone.
@@ -189,6 +188,9 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
     chunks = {
         number: _write_chunk(store, record["run"], number, scenes, named, digest) for number in scenes.chunk_numbers
     }
+    recorded_chunks = (opened.recorded.load(number).chunk for number in scenes.chunk_numbers)
+    standing = warn_of_standing_actors(opened.recorded, recorded_chunks, scenes.changed_names)
+    note = f"the traffic of run {record['run']} is edited"
     finished = FinishedRun(
         log=record["log"],
         preset=record["preset"],
@@ -196,13 +198,14 @@ def write_edited_run(store: str, run: str, edits: EditList, config: SimulateConf
         config=record["config"],
         differs={key: (before, after) for key, (before, after) in record["differs"].items()},
         chunks=chunks,
-        notes=dict.fromkeys(chunks, f"the traffic of run {record['run']} is edited"),
+        notes={number: "; ".join((note, *standing.get(number, ()))) for number in chunks},
         # Edits bring no chunk back that could not be reconstructed.
         left_out=record.get("left_out", ()),
     )
     # The scenes are those that the budget's choices made, whatever was asked for.
     extra = {"budget": record["budget"]} if "budget" in record else {}
-    extra["edited"] = {"run": record["run"], "edits": named.model_dump(mode="json")}
+    warnings = [warning for found in standing.values() for warning in found]
+    extra["edited"] = {"run": record["run"], "edits": named.model_dump(mode="json"), "warnings": warnings}
     return write_run_record(finished, summarise_run(finished), extra)
 
 
@@ -221,21 +224,25 @@ def _write_chunk(
     with measure_usage() as usage:
         edited = scenes.load(number)
     ingested = read_stage_value(store, run, number, "ingest")[1]
-    # The chunk as ingest left it, without the plan's effects: these are applied again by whoever reads it.
-    chunk = replace(ingested, actors=edited.chunk.actors)
-    values: Mapping[str, tuple[str, Any]] = {
+    recorded_plan = read_stage_value(store, run, number, "effects")[1]
+    chunk, plan = prepare_stored_chunk(ingested, recorded_plan, edited.chunk.actors)
+    values: dict[str, tuple[str, Any]] = {
         "ingest": ("chunk", chunk),
         stage: ("reconstruction", Reconstruction(edited.scene)),
     }
     opened = open_store(store)
-    refs = {"effects": _reference(next(iter(opened.artifacts(key=keys["effects"]))))}
+    refs: dict[str, ArtifactRef] = {}
+    if plan is recorded_plan:
+        refs["effects"] = _reference(next(iter(opened.artifacts(key=keys["effects"]))))
+    else:
+        values["effects"] = ("effects", plan)
     for name, (kind, value) in values.items():
         key = hashlib.sha256(f"{keys[name]}\n{digest}".encode()).hexdigest()
         address = Address(ingested.dataset, ingested.log, number, name, key)
         provenance = Provenance(
             inputs={name: keys[name]},
             configuration=edits.model_dump(mode="json"),
-            code_digest=code_digest(_CODE),
+            code_digest=code_digest(*_CODE),
             seconds=usage.seconds,
             peak_mib=usage.peak_mib,
             environment=describe_environment(),

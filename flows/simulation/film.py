@@ -119,7 +119,9 @@ class FilmWriter:
     def _describe_failure(self) -> ResourceError:
         self._process.wait()
         self._messages.seek(0)
-        text = " ".join(self._messages.read().decode(errors="replace").split())[:_MAX_MESSAGE_LENGTH]
+        text = " ".join(self._messages.read().decode(errors="replace").split())
+        # The error names the file, which has another name once it is complete.
+        text = text.replace(f"file:{self._path}", "the file").replace(str(self._path), "the file")[:_MAX_MESSAGE_LENGTH]
         return ResourceError(
             f"ffmpeg could not write the film ({text or 'no message'})",
             remedy="Look whether the disk is full, or name another --out.",

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flows.simulation.chunk_outlines import load_outlines
 from flows.simulation.edited_runs import OpenedRun, open_edited_scenes
-from flows.simulation.parked_actors import list_parked
+from flows.simulation.parked_actors import list_parked, warn_of_standing_actors
 from flows.simulation.request import SimulationRequest
 from flows.simulation.rollout_path import CheckedPath, check_path, make_path
 from flows.simulation.run_scenes import RunScenes
@@ -22,6 +23,7 @@ from genre_tasks.progress import Progress
 from genre_tasks.rollout.handover import Handover, plan_handovers
 from genre_tasks.rollout.rig import RigCamera, estimate_rig
 from genre_tasks.scene_edits.chunk_scene import SceneSource
+from genre_tasks.scene_edits.edited_scenes import EditedScenes
 from genre_tasks.suggestions import did_you_mean
 
 
@@ -37,6 +39,7 @@ class PreparedRollout:
         handovers: between chunks.
         ranges: of each chunk's scene, by number; empty where no marks are asked for.
         pose_s: seconds from one pose to the next.
+        edit_warnings: what edits do not change.
     """
 
     source: SceneSource
@@ -46,6 +49,7 @@ class PreparedRollout:
     handovers: tuple[Handover, ...]
     ranges: dict[int, SideRange]
     pose_s: float
+    edit_warnings: tuple[str, ...] = ()
 
 
 def prepare_rollout(
@@ -67,11 +71,12 @@ def prepare_rollout(
         ConfigError: the path is implausible or meets an actor.
     """
     source = _edit_traffic(request, run, config)
-    chunks = [source.load(number).chunk for number in source.chunk_numbers]
+    chunks = load_outlines(source)
+    recorded_chunks = load_outlines(run.recorded) if isinstance(source, EditedScenes) else chunks
     rig = select_cameras(estimate_rig(chunks), request.cameras)
     recorded = join_recorded_path(chunks)
     path = make_path(request, config.simulate, recorded)
-    actors = (*list_world_actors(chunks), *list_parked(run.recorded))
+    actors = (*list_world_actors(chunks), *list_parked(run.recorded, recorded_chunks))
     center_ahead_m = find_center_ahead(str(run.recorded.record["log"]), config.simulate.center_ahead_m)
     checked = check_path(request, config.simulate, path, recorded, actors, center_ahead_m=center_ahead_m)
     # After the checks, which end most of the requests that are no good, and take no time.
@@ -80,7 +85,10 @@ def prepare_rollout(
     handovers = plan_handovers(source, path, rig, config.simulate.handover_frames)
     steps = np.diff(path.times_s)
     pose_s = float(np.median(steps)) if len(steps) else DEFAULT_FRAME_S
-    return PreparedRollout(source, run.recorded, rig, checked, handovers, ranges, pose_s)
+    names = source.changed_names if isinstance(source, EditedScenes) else {}
+    standing = warn_of_standing_actors(run.recorded, recorded_chunks, names)
+    edit_warnings = tuple(warning for warnings in standing.values() for warning in warnings)
+    return PreparedRollout(source, run.recorded, rig, checked, handovers, ranges, pose_s, edit_warnings)
 
 
 def _edit_traffic(request: SimulationRequest, run: OpenedRun, config: PipelineConfig) -> SceneSource:

@@ -51,7 +51,7 @@ class FnetRepair:
                 path = image_path(folder, view.camera, images.index, ".png")
                 write_file(path, encode_png(mask.astype(np.uint8) * 255))
         # With the render's opacity, an EXR file's colours would be divided by what they were not multiplied with.
-        return replace(images, color=fixed.color.clamp(0, 1), alpha=fixed.alpha)
+        return replace(images, color=fixed.color.clamp(0, 1), alpha=fixed.alpha, depth=fixed.depth)
 
 
 def choose_repair(request: SimulationRequest, config: PipelineConfig, rollout: PreparedRollout, folder: Path) -> Repair:

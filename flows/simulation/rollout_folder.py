@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from flows.output_errors import name_output
 from genre_tasks.atomic_path import holds_files, replace_folder
 from genre_tasks.errors import ArtifactCorruptError, ConfigError, InputError
 from genre_tasks.temporary_names import temporary_folder
@@ -61,17 +62,18 @@ def write_rollout(folder: Path, make_manifest: Callable[[tuple[FileEntry, ...]],
 
     Raises:
         ConfigError: the folder was empty, and is full when the block ends.
-        OSError: a file cannot be written.
+        GenreError: a file cannot be written; it names the folder, and not the temporary one.
     """
     held_files = holds_files(folder)
-    make_folders(folder.parent)
-    # In the same folder, because a rename is atomic only within one file system.
-    with temporary_folder(folder.parent) as temporary:
-        yield temporary
-        temporary.chmod(_FOLDER_MODE)
-        write_manifest(temporary, make_manifest(list_payload(temporary)))
-        replace_folder(folder, temporary, held_files)
-        sync(folder.parent)
+    with name_output(folder):
+        make_folders(folder.parent)
+        # In the same folder, because a rename is atomic only within one file system.
+        with temporary_folder(folder.parent) as temporary:
+            yield temporary
+            temporary.chmod(_FOLDER_MODE)
+            write_manifest(temporary, make_manifest(list_payload(temporary)))
+            replace_folder(folder, temporary, held_files)
+            sync(folder.parent)
 
 
 def _read_manifest(folder: Path) -> Manifest:

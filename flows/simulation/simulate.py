@@ -45,7 +45,7 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
         InputError: there is no such run, chunk, stage or camera, or a file is unfit.
         ConfigError: the path is implausible or meets an actor, the folder holds another rollout, or another version
             wrote the record, with settings that this one does not know.
-        ResourceError: a film could not be written.
+        ResourceError: a film or another file could not be written.
     """
     request.check()
     run = open_run(request.store, request.run, request.stage, request.chunks)
@@ -132,6 +132,7 @@ def _list_warnings(rollout: PreparedRollout, metrics: dict[str, Any]) -> tuple[s
     if find_tracks(rollout.recorded) is None:
         reason = "the log is gone or another one, or its boxes cannot be read"
         warnings.append(f"{reason}: the path was not checked against parked vehicles")
+    warnings += rollout.edit_warnings
     reliable = metrics.get("reliable_fraction")
     if reliable is not None and reliable < 1:
         warnings.append(f"{1 - reliable:.0%} of the poses are outside of the scenes' reliable range")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flows.simulation.chunk_outlines import load_outlines
 from flows.simulation.edited_runs import open_run
 from flows.simulation.parked_actors import list_parked
 from flows.simulation.recorded_settings import read_simulate_config
@@ -68,11 +69,12 @@ class DrivingWorld:
     def __init__(self, store: str, run: str, stage: str | None, reliable_m: float | None, progress: Progress) -> None:
         scenes = RunScenes(store, run, stage)
         self.config: SimulateConfig = read_simulate_config(scenes.record)
-        chunks = [scenes.load(number).chunk for number in scenes.chunk_numbers]
+        chunks = load_outlines(scenes)
         self.recorded: EgoPath = join_recorded_path(chunks)
         moving = list_world_actors(chunks)
         opened = open_run(store, run, stage)
-        self._actors: tuple[WorldActor, ...] = (*moving, *list_parked(opened.recorded))
+        recorded_chunks = load_outlines(opened.recorded) if len(opened.edits) else chunks
+        self._actors: tuple[WorldActor, ...] = (*moving, *list_parked(opened.recorded, recorded_chunks))
         self._center_ahead_m = find_center_ahead(str(opened.recorded.record["log"]), self.config.center_ahead_m)
         self._reference: ReferencePath = fit_reference_path(self.recorded)
         self._layout: ChunkLayout = lay_out_chunks(scenes)
@@ -127,9 +129,8 @@ class DrivingWorld:
         """
         position = np.array([[state.x_m, state.y_m]])
         arc, lateral = self._reference.project(position, np.array([expected_m]))
-        pose = np.eye(4)
-        pose[:2, 3] = position[0]
-        place = self._layout.find_places(EgoPath(np.zeros(1), np.array([frame]), pose[None]))[0]
+        facing = np.array([math.cos(state.heading_rad), math.sin(state.heading_rad)])
+        place = self._layout.find_place(position[0], frame, facing)
         index = max(int(np.searchsorted(self._layout.first_frames, round(place), side="right")) - 1, 0)
         side = self._ranges[self._layout.numbers[index]]
         inside = -_TOLERANCE_M <= arc[0] <= self._reference.length_m + _TOLERANCE_M

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Literal, TypeVar, TypeVarTuple
 
 import numpy as np
@@ -54,18 +55,23 @@ class _BodyTooLargeError(Exception):
 
 
 class ActorState:
-    """The actors of a service: the recorded ones, until a client sets others."""
+    """The actors of a service: the recorded ones, until a client sets others.
+
+    Args:
+        renderer: of the run.
+    """
 
     def __init__(self, renderer: SceneRenderer) -> None:
         self._renderer = renderer
         self._lock = threading.Lock()
         self._trajectories = describe_recorded(renderer.actors(), renderer.frame_s)
         self._recorded = self._trajectories
+        self._placed = self._trajectories
         self._unchanged = tuple(trajectory.track_id for trajectory in self._recorded)
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """Those that images show at present."""
+        """Those that images show at present, by the ids or names that the client has sent."""
         with self._lock:
             return self._trajectories
 
@@ -78,11 +84,16 @@ class ActorState:
         Raises:
             InputError: an actor is not known, or is there twice.
         """
-        self._renderer.check_actors([trajectory.track_id for trajectory in trajectories])
+        track_ids = self._renderer.find_actors([trajectory.track_id for trajectory in trajectories])
+        # By the log's ids, as the recorded ones are: the readable name of an actor may be the id of another.
+        placed = tuple(
+            replace(trajectory, track_id=track_id) for trajectory, track_id in zip(trajectories, track_ids, strict=True)
+        )
         with self._lock:
             self._trajectories = trajectories
+            self._placed = placed
             # Recorded actors stand where they were at each camera's own moment, which the messages do not carry.
-            self._unchanged = find_unchanged(trajectories, self._recorded)
+            self._unchanged = find_unchanged(placed, self._recorded)
 
     def request_image(self, message: ImageMessage) -> ImageRequest:
         """Turns a message into a request of the renderer.
@@ -97,7 +108,7 @@ class ActorState:
         pose = np.array(message.pose, np.float64)
         time_s = message.timestamp / MICROSECONDS
         with self._lock:
-            trajectories = self._trajectories
+            trajectories = self._placed
             unchanged = self._unchanged
         is_recorded = len(unchanged) == len(trajectories) == len(self._recorded)
         placed = [t.pose_at(message.timestamp) for t in trajectories if t.track_id not in unchanged]

@@ -58,7 +58,7 @@ class Trajectory:
     """Where a simulator lets an actor drive.
 
     Attributes:
-        track_id: the log's id, or a readable name.
+        track_id: the log's id, or a readable name in what a client sends.
         times_us: [T] microseconds, rising.
         world_SE3_box: [T, 4, 4] at these times.
         width_length_height_m: as stated; boxes keep the size of their Gaussians.
@@ -91,8 +91,8 @@ def find_unchanged(trajectories: Sequence[Trajectory], others: Sequence[Trajecto
     """Finds the actors that drive in the same way, in any order.
 
     Args:
-        trajectories: of some actors.
-        others: of the same ones, or of others.
+        trajectories: of some actors, by the log's ids.
+        others: of the same ones, or of others; by the log's ids, too.
 
     Returns:
         Track ids, in the order of ``trajectories``.

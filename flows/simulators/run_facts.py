@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flows.simulation.chunk_outlines import drop_measurements
 from flows.simulators.image_request import ActorDescription, CameraDescription
 from flows.simulators.run_clock import RunClock, read_clock
 from genre_tasks.ego_paths.world_actors import list_world_actors
 from genre_tasks.lidar_simulation.ego_motion import interpolate_poses
 from genre_tasks.logs.types import Float64
 from genre_tasks.rollout.rig import estimate_rig
-from genre_tasks.scene.chunk import Chunk, Points
+from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 
@@ -60,7 +61,7 @@ def read_run_facts(source: SceneSource, names: Mapping[str, str] | None = None) 
     # Every chunk once, in order: a source keeps only the last few in memory.
     for number in source.chunk_numbers:
         loaded = source.load(number)
-        chunks.append(_without_measurements(loaded.chunk))
+        chunks.append(drop_measurements(loaded.chunk))
         for actor in loaded.scene.actors:
             chunks_by_track[actor.track_id] = (*chunks_by_track.get(actor.track_id, ()), number)
     clock = read_clock(chunks)
@@ -91,13 +92,6 @@ def read_run_facts(source: SceneSource, names: Mapping[str, str] | None = None) 
         chunks_by_track=chunks_by_track,
         ego_masks=_find_ego_masks(chunks),
     )
-
-
-def _without_measurements(chunk: Chunk) -> Chunk:
-    """The chunk without images and points, which are most of its memory."""
-    views = tuple(replace(view, image=b"") for view in chunk.views)
-    actors = tuple(replace(actor, points=_NO_POINTS) for actor in chunk.actors)
-    return replace(chunk, views=views, actors=actors, static=_NO_POINTS)
 
 
 def _join_ego_poses(chunks: Sequence[Chunk], clock: RunClock) -> Float64:
@@ -135,8 +129,3 @@ def _find_ego_masks(chunks: Sequence[Chunk]) -> dict[str, NDArray[np.bool_]]:
             if view.ego_mask is not None:
                 masks.setdefault(view.camera, view.ego_mask)
     return masks
-
-
-_NO_POINTS = Points(
-    np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), np.zeros(0, np.bool_), np.zeros(0, np.int16)
-)

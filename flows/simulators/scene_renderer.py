@@ -181,16 +181,19 @@ class SceneRenderer:
         mask = self._facts.ego_masks.get(camera)
         return None if mask is None else mask.copy()
 
-    def check_actors(self, track_ids: Sequence[str]) -> None:
-        """Checks that the run has actors.
+    def find_actors(self, words: Sequence[str]) -> tuple[str, ...]:
+        """Finds which actors of the run are meant.
 
         Args:
-            track_ids: the log's ids, or readable names.
+            words: the log's ids, or readable names.
+
+        Returns:
+            The log's id of each.
 
         Raises:
             InputError: an actor is not known, or is there twice.
         """
-        self._placer.resolve(track_ids)
+        return self._placer.resolve(words)
 
     def render(self, request: ImageRequest) -> NDArray[np.uint8]:
         """Renders one image.
@@ -278,14 +281,17 @@ class SceneRenderer:
     def _find_scene(self, request: ImageRequest, middle: Float64, frame: float, middle_s: float) -> ChunkScene:
         """The scene whose background is that of the place, and whose traffic is that of the moment."""
         clock = self._facts.clock
-        world_SE3_ego = middle
+        position = middle[:2, 3]
+        # A camera of the simulator's own may look anywhere: it does not say where the vehicle faces.
+        facing: Float64 | None = None
         lead = 0.0
         if request.camera is not None:
             world_SE3_ego = middle @ invert_se3(self.cameras[request.camera].rig_SE3_camera)
+            position = world_SE3_ego[:2, 3]
+            facing = world_SE3_ego[:2, 0]
             # Images of one frame belong together, although the vehicle drives on from one camera to the next.
             lead = frame - clock.find_frame(middle_s)
-        path = EgoPath(np.zeros(1), np.array([frame - lead]), world_SE3_ego[None])
-        place = float(self._layout.find_places(path)[0]) + lead
+        place = self._layout.find_place(position, frame - lead, facing) + lead
         return self._schedule.find(place, frame)[0].chunk_scene
 
     def _check(self, request: ImageRequest) -> None:
@@ -300,7 +306,7 @@ class SceneRenderer:
                 remedy=f"It lasts from {first_s:.6f} to {last_s:.6f} s.",
             )
         if request.actors is not None:
-            self.check_actors([actor.track_id for actor in request.actors])
+            self.find_actors([actor.track_id for actor in request.actors])
 
     def _check_camera(self, camera: str) -> None:
         if camera not in self.cameras:

@@ -62,7 +62,7 @@ EFFECT = Effect(
     property="image area with texture and without LiDAR",
     unit="%",
     threshold=4.0,
-    cost="two seconds for ten source images",
+    cost="a depth map for each source image, which is checked against all the others",
     measure=measure,
     fit=fit,
 )

@@ -95,4 +95,6 @@ EFFECT = Effect(
     threshold=1.25,
     cost="a deformation a frame",
     measure=measure,
+    # Without nodes of their own, actors are points of the background, which has no boxes that could deform.
+    requires="rigid_actors",
 )

@@ -51,7 +51,7 @@ def plan_effects(
         One decision for each effect, and the parameters of those that are on.
 
     Raises:
-        ConfigError: an effect is set on that the log makes impossible.
+        ConfigError: an effect is set on that the log makes impossible, or another effect that is off.
     """
     # Measurements are shared: two effects that look at the same images decode them once.
     measurements = ChunkMeasurements(chunk, cameras)
@@ -59,7 +59,7 @@ def plan_effects(
     parameters = EffectParameters()
     for k, name in enumerate(EFFECT_NAMES):
         progress(k, len(EFFECT_NAMES), name)
-        decision = _decide(name, getattr(config, name), measurements)
+        decision = _decide(name, getattr(config, name), measurements, decisions)
         decisions.append(decision)
         # An effect that is only reported has nothing to apply.
         if decision.choice == "on":
@@ -72,7 +72,7 @@ def plan_effects(
     return EffectsPlan(tuple(decisions), parameters)
 
 
-def _decide(name: str, setting: str, measurements: ChunkMeasurements) -> Decision:
+def _decide(name: str, setting: str, measurements: ChunkMeasurements, decisions: Sequence[Decision]) -> Decision:
     # Measuring can take seconds: an effect that is turned off costs nothing.
     if setting == "off":
         return Decision(
@@ -98,6 +98,17 @@ def _decide(name: str, setting: str, measurements: ChunkMeasurements) -> Decisio
         )
     measurement = effect.measure(measurements) if missing is None else Measurement(None, missing)
     choice, reason = _choose(effect, measurement, setting)
+    unmet = _find_unmet(effect, decisions)
+    # Where nothing calls for the effect, nothing is missed without the other one.
+    if unmet is not None and choice == "on" and measurement.value:
+        if setting == "on":
+            raise ConfigError(
+                f"the effect {name} is set on, and {unmet}",
+                remedy=f"Set effects.{name} to auto or off, or effects.{effect.requires} to on.",
+                log=measurements.chunk.log,
+                chunk=measurements.chunk.index,
+            )
+        choice, reason = "off", f"{unmet}; {reason}"
     return Decision(
         name=name,
         property=effect.property,
@@ -109,6 +120,12 @@ def _decide(name: str, setting: str, measurements: ChunkMeasurements) -> Decisio
         reason=reason,
         cost=effect.cost,
     )
+
+
+def _find_unmet(effect: Effect, decisions: Sequence[Decision]) -> str | None:
+    """Names the effect that another one needs where it is not on; ``None`` where nothing is missing."""
+    is_on = any(decision.name == effect.requires and decision.choice == "on" for decision in decisions)
+    return None if effect.requires is None or is_on else f"{effect.requires}, which it needs, is off"
 
 
 def _choose(effect: Effect, measurement: Measurement, setting: str) -> tuple[Choice, str]:

@@ -105,6 +105,7 @@ class Effect:
         find_missing: names what the log lacks for the effect to be possible; ``None`` if it is possible.
         report_only: the effect is reported, and not modelled.
         fit: estimates what applying the effect needs to know; called where the effect is on.
+        requires: an effect that is decided before it, and without which it does nothing; ``None``: it needs no other.
     """
 
     name: str
@@ -117,6 +118,7 @@ class Effect:
     find_missing: Callable[[ChunkMeasurements], str | None] = lambda _: None
     report_only: bool = False
     fit: Callable[[ChunkMeasurements], EffectParameters] = lambda _: EffectParameters()
+    requires: str | None = None
 
 
 @dataclass(frozen=True)

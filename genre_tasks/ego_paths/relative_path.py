@@ -10,8 +10,11 @@ from genre_tasks.ego_paths.reference_path import fit_reference_path
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import Float64
 
-_STANDING_M = 0.01
-"""Who comes less far between two poses does not turn for going sideways."""
+_STANDING_M_S = 0.1
+"""Who drives slower does not turn for going sideways. As a speed, it holds however dense the poses of a path are."""
+
+# So far before the first recorded pose is rounding.
+_BEFORE_START_M = 0.01
 
 
 def place_relative_path(
@@ -35,7 +38,7 @@ def place_relative_path(
     reference = fit_reference_path(recorded)
     recorded_s = np.interp(frames, recorded.frames, recorded.times_s - recorded.times_s[0])
     arc = reference.locate(recorded_s) + ahead_m
-    before = np.flatnonzero(arc < -_STANDING_M)
+    before = np.flatnonzero(arc < -_BEFORE_START_M)
     if len(before):
         row = int(before[0])
         raise InputError(
@@ -45,7 +48,8 @@ def place_relative_path(
     arc = np.maximum(arc, 0.0)
     if len(arc) > 1:
         driven = np.gradient(arc)
-        slope = np.where(np.abs(driven) > _STANDING_M, np.gradient(lateral_m) / np.where(driven == 0, 1, driven), 0.0)
+        drives = np.abs(driven) > _STANDING_M_S * np.gradient(times_s)
+        slope = np.where(drives, np.gradient(lateral_m) / np.where(driven == 0, 1, driven), 0.0)
     else:
         slope = np.zeros(1)
     stretch = 1 - reference.sample(arc).curvature_1_m * lateral_m

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,6 +12,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from genre_tasks.errors import InputError
+from genre_tasks.exchange.file_digests import DOCUMENT_ENTRY, digest_contents, insert_digest
 from genre_tasks.exchange.moments import Frame, is_rising
 from genre_tasks.exchange.registry import find_format, load_format
 from genre_tasks.exchange.types import ExchangeNode, ExchangeScene, NodeMotion
@@ -26,7 +26,6 @@ KIND = "genre-scene"
 VERSION = 1
 
 _MOST_BYTES = 256 << 20
-_BLOCK_BYTES = 1 << 20
 _REMEDY = "Export the scene again, or give one of its files."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -109,6 +108,7 @@ class SceneDocument(BaseModel):
     chunks: tuple[ChunkEntry, ...]
     losses: tuple[str, ...] = ()
     files: tuple[FileDigest, ...] = ()
+    document_sha256: str = Field("", pattern="^([0-9a-f]{64})?$")
 
 
 def describe_chunk(number: int, scene: ExchangeScene, source: dict[str, Any]) -> ChunkEntry:
@@ -141,20 +141,21 @@ def digest_files(folder: Path) -> tuple[FileDigest, ...]:
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / SCENE_FILE)
     return tuple(
-        FileDigest(path=path.relative_to(folder).as_posix(), sha256=_digest(path), size=path.stat().st_size)
+        FileDigest(path=path.relative_to(folder).as_posix(), sha256=digest_contents(path), size=path.stat().st_size)
         for path in paths
     )
 
 
 def write_document(folder: Path, document: SceneDocument) -> None:
-    """Writes ``scene.json``.
+    """Writes ``scene.json``, with its digest: an export over a changed one would lose what somebody wrote.
 
     Args:
         folder: with the files that the document names.
         document: of the folder.
     """
-    text = json.dumps(document.model_dump(mode="json"), indent=1, ensure_ascii=False, allow_nan=False)
-    (folder / SCENE_FILE).write_text(text + "\n", encoding="utf-8")
+    values = document.model_dump(mode="json") | {DOCUMENT_ENTRY: ""}
+    text = json.dumps(values, indent=1, ensure_ascii=False, allow_nan=False)
+    (folder / SCENE_FILE).write_text(insert_digest(text + "\n"), encoding="utf-8")
 
 
 def read_document(folder: Path) -> SceneDocument:
@@ -228,9 +229,8 @@ def find_changes(folder: Path) -> tuple[str, ...]:
     Raises:
         InputError: as :func:`read_document`.
     """
-    return tuple(
-        entry.path for entry in read_document(folder).files if _digest(_inside(folder, entry.path)) != entry.sha256
-    )
+    entries = read_document(folder).files
+    return tuple(entry.path for entry in entries if digest_contents(_inside(folder, entry.path)) != entry.sha256)
 
 
 def _read_chunk_file(folder: Path, _format: str, entry: ChunkEntry) -> ExchangeScene:
@@ -324,14 +324,6 @@ def _inside(folder: Path, name: str) -> Path:
     if not parts or leads_out or not path.is_file() or path.resolve() != folder.resolve() / name:
         raise InputError(f"the folder has no file '{name}'", remedy=_REMEDY, file=folder)
     return path
-
-
-def _digest(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _to_matrix(pose: Float64) -> Matrix:

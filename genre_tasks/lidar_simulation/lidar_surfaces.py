@@ -33,6 +33,7 @@ MIN_ACTOR_POINTS = 50
 """An actor with fewer points has the Gaussians of the scene in place of discs."""
 
 _NODES_IN_MEMORY = 256
+_NO_NODE = -1
 
 _CONFIG = InitialConfig(opacity=0.95, neighbours=12)
 
@@ -66,7 +67,10 @@ class LidarSurfaces:
         if len(chunk.actors) != len(scene.actors):
             raise ValueError(f"expected the actors of one chunk, got {len(chunk.actors)} and {len(scene.actors)}")
         static = self._reuse(chunk.static, lambda: _fit_static(chunk, self._max_discs))
-        actors = [self._build_actor(actor, scene, k) for k, actor in enumerate(chunk.actors)]
+        # A shadow is part of its actor's node, and no beam meets it.
+        nodes = scene.nodes.masked_fill(chunk_scene.find_shadows(), _NO_NODE)
+        solid = replace(scene, nodes=nodes)
+        actors = [self._build_actor(actor, solid, k) for k, actor in enumerate(chunk.actors)]
         nothing_distant = Gaussians.unpack(torch.zeros(0, 14))
         surfaces = assemble_scene(chunk, static, nothing_distant, actors)
         # The scene's boxes: an edit moves them.

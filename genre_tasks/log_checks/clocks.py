@@ -11,8 +11,12 @@ from genre_tasks.log_checks.log_sample import LogSample
 from genre_tasks.logs.findings import Finding, format_frames
 from genre_tasks.logs.types import Camera, Float64
 
-# A camera of a 10 Hz rig fires within one period of its sweep. Argoverse 2 has images 0.147 s from theirs.
-_MAX_CAMERA_OFFSET_S = 0.15
+# Of the time between sweeps: a camera fires about once in it. Argoverse 2, at 10 Hz, has images 0.147 s from theirs.
+_MAX_OFFSET_PERIODS = 1.5
+# The same for the usual rate of 10 Hz, where a single sweep tells none.
+_USUAL_MAX_OFFSET_S = 0.15
+# Clocks of two epochs differ by seconds, and those of a rig by parts of one, at any rate of sweeps.
+_EPOCH_TOLERANCE_S = 0.15
 # Plausible time between frames; outside, the timestamps' unit is in doubt.
 _FRAME_PERIOD_RANGE_S = (0.005, 2.0)
 # Of the usual time between frames: more than a frame's time late is a frame that was dropped.
@@ -118,8 +122,9 @@ def _judge_camera(sample: LogSample, camera: Camera) -> Iterator[Finding]:
     """A finding where images are far in time from their sweeps, with the reason where one can be told."""
     camera_times = sample.camera_times_s(camera)
     offsets = camera_times - sample.times_s
+    limit_s = _limit_offsets(sample.times_s)
     # The comparison is negated so that a NaN counts as late.
-    late = np.flatnonzero(~(np.abs(offsets) <= _MAX_CAMERA_OFFSET_S))
+    late = np.flatnonzero(~(np.abs(offsets) <= limit_s))
     if not late.size:
         return
     frames = tuple(sample.frames[int(k)] for k in late)
@@ -128,17 +133,28 @@ def _judge_camera(sample: LogSample, camera: Camera) -> Iterator[Finding]:
         yield Finding("camera_clock", "warning", message, _CLOCK_REMEDY, {}, camera.name, frames)
         return
     largest = float(np.nanmax(np.abs(offsets), initial=0.0))
-    reason = _explain_offsets(sample.times_s, camera_times)
+    reason = _explain_offsets(sample.times_s, camera_times, min(limit_s, _EPOCH_TOLERANCE_S))
     message = (
-        f"{camera.name}: frames {format_frames(frames)} are over {_MAX_CAMERA_OFFSET_S} s from their sweep, "
+        f"{camera.name}: frames {format_frames(frames)} are over {limit_s:.3g} s from their sweep, "
         f"up to {largest:.6g} s{reason}"
     )
-    numbers = {"largest_offset_s": largest, "limit_s": _MAX_CAMERA_OFFSET_S}
+    numbers = {"largest_offset_s": largest, "limit_s": limit_s}
     yield Finding("camera_clock", "warning", message, _CLOCK_REMEDY, numbers, camera.name, frames)
 
 
-def _explain_offsets(sweep_times: Float64, camera_times: Float64) -> str:
-    """What may be behind large offsets: a unit, an epoch, a time zone, a delay, a drift, or nothing that is known."""
+def _limit_offsets(sweep_times: Float64) -> float:
+    """How many seconds an image may be from its sweep, by the log's rate of sweeps: key frames are at 2 Hz."""
+    steps = np.diff(sweep_times)
+    steps = steps[(steps > 0) & np.isfinite(steps)]
+    # The median, which sweeps that were dropped do not change.
+    return _MAX_OFFSET_PERIODS * float(np.median(steps)) if steps.size else _USUAL_MAX_OFFSET_S
+
+
+def _explain_offsets(sweep_times: Float64, camera_times: Float64, tolerance_s: float) -> str:
+    """What may be behind large offsets: a unit, an epoch, a time zone, a delay, a drift, or nothing that is known.
+
+    Offsets that differ by ``tolerance_s`` at most count as one.
+    """
     known = np.isfinite(sweep_times) & np.isfinite(camera_times)
     if known.sum() < 2:
         return ""
@@ -153,9 +169,9 @@ def _explain_offsets(sweep_times: Float64, camera_times: Float64) -> str:
         if abs(rate / factor - 1) < 0.1:
             return f": the sweeps' times look like {unit} where the camera's are seconds"
     shift = float(np.median(offsets))
-    if float(np.abs(offsets - shift).max()) <= _MAX_CAMERA_OFFSET_S:
+    if float(np.abs(offsets - shift).max()) <= tolerance_s:
         return f": always by {shift:.6g} s{_explain_shift(shift)}"
-    jumps = np.flatnonzero(np.abs(np.diff(offsets)) > _MAX_CAMERA_OFFSET_S)
+    jumps = np.flatnonzero(np.abs(np.diff(offsets)) > tolerance_s)
     if 0 < jumps.size <= _MAX_JUMPS:
         frames = np.flatnonzero(known)[jumps + 1]
         sizes = ", ".join(f"{np.diff(offsets)[jump]:.6g} s" for jump in jumps)
@@ -167,9 +183,9 @@ def _explain_offsets(sweep_times: Float64, camera_times: Float64) -> str:
 
 def _explain_shift(shift_s: float) -> str:
     for known in _EPOCH_SHIFTS:
-        if abs(abs(shift_s) - known.seconds) <= _MAX_CAMERA_OFFSET_S:
+        if abs(abs(shift_s) - known.seconds) <= _EPOCH_TOLERANCE_S:
             return f", as {known.reason}"
     half_hours = shift_s / 1800
-    if round(half_hours) and abs(half_hours - round(half_hours)) * 1800 <= _MAX_CAMERA_OFFSET_S and abs(shift_s) < 1e5:
+    if round(half_hours) and abs(half_hours - round(half_hours)) * 1800 <= _EPOCH_TOLERANCE_S and abs(shift_s) < 1e5:
         return ", as a time zone"
     return ""

@@ -268,9 +268,22 @@ def _render_elsewhere(backend: str, splats: Splats, cameras: Cameras) -> Render:
         from genre_tasks.render.reference import render_reference
 
         return _result(*render_reference(splats, cameras))
+    # gsplat does not promise to take empty tensors.
+    if not (len(splats) and len(cameras)):
+        return _render_nothing(splats, cameras)
     from genre_tasks.render.cuda import render_cuda
 
     return _result(*render_cuda(splats, cameras))
+
+
+def _render_nothing(splats: Splats, cameras: Cameras) -> Render:
+    """V images without any Gaussian; gradients of all inputs are zero, as where Gaussians are out of sight."""
+    inputs = (splats.means, splats.scales, splats.quats, splats.opacities, splats.colors, cameras.camera_SE3_chunk)
+    # Of empty slices alone: an input that is not finite would make zero times itself NaN.
+    nothing = torch.stack([x[:0].sum().to(splats.means.device, torch.float32) for x in inputs]).sum()
+    size = (len(cameras), cameras.height_px, cameras.width_px)
+    color, alpha, depth = (nothing.expand(*shape).clone() for shape in ((*size, 3), size, size))
+    return Render(color, alpha, depth, {})
 
 
 def _result(images: tuple[Tensor, Tensor, Tensor], culled: dict[str, int]) -> Render:

@@ -14,6 +14,9 @@ from genre_tasks.scene_edits.chunk_scene import SceneSource
 _M_PER_FRAME = 0.002
 # An actor is posed by the nearest frame, and exposures move it by less than half a frame.
 _NEAREST_FRAME = 0.49
+# A place that was recorded facing the other way counts as so much farther. Lanes of one street are nearer to each other
+# than that, and who turns around where there is no other lane stays there.
+_OTHER_WAY_M = 20.0
 
 
 @dataclass(frozen=True)
@@ -26,6 +29,7 @@ class ChunkLayout:
         last_frames: [N] last log frame of each chunk.
         frames: [F] all log frames.
         positions: [F, 2] of the recorded vehicle in the ground plane of the log's world, metres.
+        facings: [F, 2] where it faces, in the same plane; unit vectors where it is level.
     """
 
     numbers: tuple[int, ...]
@@ -33,6 +37,7 @@ class ChunkLayout:
     last_frames: tuple[int, ...]
     frames: Float64
     positions: Float64
+    facings: Float64
 
     def find_traffic(self, frame: float) -> tuple[int, ...]:
         """Finds the chunks whose actors exist at a moment.
@@ -57,24 +62,41 @@ class ChunkLayout:
             path: P poses.
 
         Returns:
-            [P] log frames, or moments between two; of several the one nearest to the pose's own moment.
+            [P] log frames, or moments between them: see :meth:`find_place`.
+        """
+        poses = path.world_SE3_ego
+        placed = zip(poses[:, :2, 3], path.frames, poses[:, :2, 0], strict=True)
+        return np.array([self.find_place(position, float(frame), facing) for position, frame, facing in placed])
+
+    def find_place(self, position: Float64, frame: float, facing: Float64 | None) -> float:
+        """Finds when the recorded vehicle was at a place.
+
+        Args:
+            position: [2] in the ground plane of the log's world, metres.
+            frame: log frame of the moment.
+            facing: [2] where the vehicle faces, of any length; ``None``: not known.
+
+        Returns:
+            A log frame, or a moment between two. Of several the one nearest to ``frame``, and rather one at which the
+            recorded vehicle did not face the other way: on a log with a U-turn that is the other lane.
         """
         start = self.positions[:-1]
         step = self.positions[1:] - start
         if not len(step):
-            return np.full(len(path), self.frames[0])
+            return float(self.frames[0])
         squared_length = np.maximum((step**2).sum(1), 1e-12)
-        places = np.empty(len(path))
-        for index, pose in enumerate(path.world_SE3_ego):
-            offset = pose[:2, 3] - start
-            fraction = np.clip((offset * step).sum(1) / squared_length, 0, 1)
-            distance = np.linalg.norm(offset - fraction[:, None] * step, axis=1)
-            # The recorded poses too: while the vehicle stands, the way between two of them has no direction.
-            distance = np.append(distance, np.linalg.norm(pose[:2, 3] - self.positions, axis=1))
-            moments = np.append(self.frames[:-1] + fraction * np.diff(self.frames), self.frames)
-            cost = distance + _M_PER_FRAME * np.abs(moments - path.frames[index])
-            places[index] = moments[cost.argmin()]
-        return places
+        offset = position - start
+        fraction = np.clip((offset * step).sum(1) / squared_length, 0, 1)
+        distance = np.linalg.norm(offset - fraction[:, None] * step, axis=1)
+        # The recorded poses too: while the vehicle stands, the way between two of them has no direction.
+        distance = np.append(distance, np.linalg.norm(position - self.positions, axis=1))
+        moments = np.append(self.frames[:-1] + fraction * np.diff(self.frames), self.frames)
+        cost = distance + _M_PER_FRAME * np.abs(moments - frame)
+        if facing is not None:
+            # By where the vehicle faces, which standing and reversing do not change as they do the direction driven.
+            turned = self.facings @ facing < 0
+            cost[np.append(turned[:-1] | turned[1:], turned)] += _OTHER_WAY_M
+        return float(moments[cost.argmin()])
 
 
 def lay_out_chunks(source: SceneSource) -> ChunkLayout:
@@ -90,13 +112,21 @@ def lay_out_chunks(source: SceneSource) -> ChunkLayout:
     lasts = []
     frames = []
     positions = []
+    facings = []
     # Every chunk once, in order: a source keeps only the last few in memory.
     for number in source.chunk_numbers:
         chunk = source.load(number).chunk
         firsts.append(chunk.frames[0])
         lasts.append(chunk.frames[-1])
         frames.append(np.asarray(chunk.frames, np.float64))
-        positions.append((chunk.world_SE3_chunk @ chunk.chunk_SE3_ego)[:, :2, 3])
+        world_SE3_ego = chunk.world_SE3_chunk @ chunk.chunk_SE3_ego
+        positions.append(world_SE3_ego[:, :2, 3])
+        facings.append(world_SE3_ego[:, :2, 0])
     return ChunkLayout(
-        tuple(source.chunk_numbers), tuple(firsts), tuple(lasts), np.concatenate(frames), np.concatenate(positions)
+        numbers=tuple(source.chunk_numbers),
+        first_frames=tuple(firsts),
+        last_frames=tuple(lasts),
+        frames=np.concatenate(frames),
+        positions=np.concatenate(positions),
+        facings=np.concatenate(facings),
     )

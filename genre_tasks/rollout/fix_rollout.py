@@ -48,11 +48,13 @@ class FixedRolloutImages:
         color: [C, H, W, 3] sRGB in [0, 1].
         filled: [C, H, W] true where a removed actor hid what no recorded image shows: FNet drew it.
         alpha: [C, H, W] opacity in [0, 1]: 1 where FNet drew, else the render's.
+        depth: [C, H, W] metres, 0 where unknown: the render's, and where ``filled`` that of the background.
     """
 
     color: Tensor
     filled: Tensor
     alpha: Tensor
+    depth: Tensor
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,8 @@ class RolloutFixer:
         novel, filled = self._paste_repaired(images, novel, chunk_images)
         color = self._run_network(images, novel, chunk_images, range(len(images.views)))
         self._last.remember(images, color)
-        return FixedRolloutImages(color, filled, torch.ones_like(images.alpha))
+        depth = _fill_depth(images, novel, filled)
+        return FixedRolloutImages(color, filled, torch.ones_like(images.alpha), depth)
 
     @torch.no_grad()
     def fill(self, images: RolloutImages) -> FixedRolloutImages:
@@ -142,7 +145,7 @@ class RolloutFixer:
         """
         nowhere = torch.zeros_like(images.alpha, dtype=torch.bool)
         if not images.chunk_scene.removed:
-            return FixedRolloutImages(images.color, nowhere, images.alpha)
+            return FixedRolloutImages(images.color, nowhere, images.alpha, images.depth)
         chunk_images = self._load_chunk(images)
         novel = self._render_inputs(images, chunk_images)
         novel, filled = self._paste_repaired(images, novel, chunk_images)
@@ -153,7 +156,8 @@ class RolloutFixer:
             fixed = self._run_network(images, novel, chunk_images, rows)
             color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
         self._last.remember(images, color)
-        return FixedRolloutImages(color, filled, images.alpha.masked_fill(filled, 1.0))
+        depth = _fill_depth(images, novel, filled)
+        return FixedRolloutImages(color, filled, images.alpha.masked_fill(filled, 1.0), depth)
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
         chunk = images.chunk_scene.chunk
@@ -210,9 +214,7 @@ class RolloutFixer:
     def _find_area(self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages) -> Tensor:
         if not images.chunk_scene.removed:
             return torch.zeros_like(images.alpha, dtype=torch.bool)
-        rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
-        depth = torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
-        return find_uncovered_area(images, depth, chunk_images.removed, self._settings)
+        return find_uncovered_area(images, _find_depth(novel), chunk_images.removed, self._settings)
 
     def _paste_repaired(
         self, images: RolloutImages, novel: NovelViews, chunk_images: _ChunkImages
@@ -267,6 +269,18 @@ class RolloutFixer:
             reduction = find_reduction(self._config.max_network_px, *image.shape[1:])
             chunk_images.latents[reference] = encode_reference(self._network, image, reduction).latent
         return chunk_images.latents[reference]
+
+
+def _find_depth(novel: NovelViews) -> Tensor:
+    """[V, H, W] metres by the LiDAR map, and by the scene where LiDAR has nothing; 0 where neither knows."""
+    rendered = torch.where(novel.alpha >= MIN_ALPHA, novel.depth, torch.zeros_like(novel.depth))
+    return torch.where(novel.lidar_alpha >= MIN_ALPHA, novel.lidar_depth, rendered)
+
+
+def _fill_depth(images: RolloutImages, novel: NovelViews, filled: Tensor) -> Tensor:
+    """The depth of the render, and where the fixer filled a hole that of what ``novel`` shows there."""
+    # A render looks through the thin Gaussians of a hole at something behind.
+    return torch.where(filled, _find_depth(novel), images.depth)
 
 
 def _paste(novel: NovelViews, area: Tensor, repaired: Render) -> NovelViews:

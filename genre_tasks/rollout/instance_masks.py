@@ -15,8 +15,10 @@ from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.render_rollout import DEFAULT_SETTINGS, RolloutImages
 from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.actor_node import ActorNode
+from genre_tasks.scene.constants import ABSENT_LOGIT
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
+from genre_tasks.scene_edits.chunk_scene import ChunkScene
 
 MIN_ALPHA = 0.5
 """A pixel that less of is covered shows nothing in particular."""
@@ -37,7 +39,7 @@ class NodeWeights:
 
     Attributes:
         nodes: K nodes of the scene graph: background, distant region, and the actors that may be in a view.
-        weights: [K, C, H, W] in [0, 1]; they sum up to alpha.
+        weights: [K, C, H, W] in [0, 1]; they sum up to alpha, without contact shadows.
     """
 
     nodes: tuple[int, ...]
@@ -113,7 +115,7 @@ def render_node_weights(images: RolloutImages, settings: RenderSettings = DEFAUL
     """Renders how much background, distant region and actors contribute to pixels.
 
     The renderer blends three numbers a Gaussian, so three nodes share a render; actors outside of all views are left
-    out. A view with motion blur has the weights of its pose's own time.
+    out. A view with motion blur has the weights of its pose's own time. A contact shadow counts as the ground under it.
 
     Args:
         images: of one pose of a rollout.
@@ -122,7 +124,7 @@ def render_node_weights(images: RolloutImages, settings: RenderSettings = DEFAUL
     Returns:
         The weights.
     """
-    scene = images.chunk_scene.scene
+    scene = _hide_shadows(images.chunk_scene)
     views = [replace(view, blur=None) for view in images.views]
     visible = [k for k, actor in enumerate(scene.actors) if any(is_in_view(actor, view) for view in views)]
     nodes = (STATIC, DISTANT, *(FIRST_ACTOR + k for k in visible))
@@ -166,6 +168,14 @@ def is_in_view(actor: ActorNode, view: RolloutView) -> bool:
 def _box_corners(size_m: tuple[float, float, float]) -> Float64:
     signs = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), -1).reshape(-1, 3)
     return np.asarray(signs * np.array(size_m))
+
+
+def _hide_shadows(chunk_scene: ChunkScene) -> SceneGraph:
+    # A shadow belongs to its actor's node, and would make thin ground a part of the actor.
+    is_shadow = chunk_scene.find_shadows()
+    gaussians = chunk_scene.scene.gaussians
+    opacities = gaussians.logit_opacities.masked_fill(is_shadow, ABSENT_LOGIT)
+    return chunk_scene.scene.with_gaussians(replace(gaussians, logit_opacities=opacities))
 
 
 def _color_nodes(scene: SceneGraph, group: Sequence[int]) -> SceneGraph:

@@ -73,7 +73,7 @@ def separate_removed_actors(
 
     Args:
         scene: as recorded.
-        removed: actors that an edit took away or moved, as recorded.
+        removed: actors that an edit took away or moved, as recorded; their tracks may go on in other chunks.
         sources: recorded images.
         views: those of the images, in the same order, without motion blur.
         settings: of the renderer.
@@ -81,7 +81,10 @@ def separate_removed_actors(
     Returns:
         The images without what the actors hide.
     """
-    actors = select_actors(scene, {actor.track_id for actor in removed})
+    tracks = {actor.track_id: actor for actor in removed}
+    actors = select_actors(scene, tracks)
+    # A pose may be of a moment that another chunk has recorded, and the tracks of the edit go on there.
+    actors = replace(actors, actors=tuple(tracks.get(actor.track_id, actor) for actor in actors.actors))
     hidden = []
     for source, view in zip(sources, views, strict=True):
         drawn = render_views(actors, [view], settings)

@@ -42,7 +42,9 @@ def extend_traffic(chunk_scene: ChunkScene, other: ChunkScene) -> ChunkScene:
     actors = _extend_tracks(chunk_scene.chunk.actors, other.chunk.actors, chunk_SE3_other)
     removed = _extend_tracks(chunk_scene.removed, other.removed, chunk_SE3_other)
     chunk = replace(chunk_scene.chunk, actors=actors)
-    return ChunkScene(chunk, replace(scene, actors=nodes), removed)
+    added_shadows = {name: count for name, count in other.shadow_counts.items() if name not in known}
+    shadow_counts = {**chunk_scene.shadow_counts, **added_shadows}
+    return ChunkScene(chunk, replace(scene, actors=nodes), removed, shadow_counts)
 
 
 def compose_scene(background: ChunkScene, traffic: ChunkScene) -> ChunkScene:
@@ -75,7 +77,7 @@ def compose_scene(background: ChunkScene, traffic: ChunkScene) -> ChunkScene:
     actors = _extend_tracks((), traffic.chunk.actors, chunk_SE3_other)
     # What hid the background where it was recorded counts as well.
     removed = _extend_tracks(background.removed, traffic.removed, chunk_SE3_other)
-    return ChunkScene(replace(background.chunk, actors=actors), scene, removed)
+    return ChunkScene(replace(background.chunk, actors=actors), scene, removed, traffic.shadow_counts)
 
 
 def _extend_tracks(tracks: Sequence[Track], others: Sequence[Track], chunk_SE3_other: Float64) -> tuple[Track, ...]:

@@ -165,7 +165,7 @@ def take_step(
     levels: Sequence[ImageSlopes],
     mounts: Float64,
     rig: Float64,
-) -> tuple[Float64, Float64]:
+) -> tuple[Float64, Float64] | None:
     """Takes one Gauss–Newton step of all motions; a point's own brightness is eliminated.
 
     Args:
@@ -177,7 +177,7 @@ def take_step(
         rig: [F, 6] present motions of the rig.
 
     Returns:
-        The motions after the step.
+        The motions after the step; ``None`` where no point is well inside an image.
     """
     brightness = np.zeros(observed.shape)
     seen = np.zeros(observed.shape, bool)
@@ -197,6 +197,8 @@ def take_step(
         return _slopes_by_motion(image, mounts[image.mount], local.take(well_inside, axis=0), slope_u, slope_v)
 
     slopes = map_single_threaded(measure_image, range(len(images)))
+    if not seen.any():
+        return None
     residual, weight = _robust_residual(brightness, seen)
     # One thread: sums do not depend on the number of cores.
     with torch_threads(1):

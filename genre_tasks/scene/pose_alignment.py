@@ -132,7 +132,11 @@ def _find_motions(
             return None
         for _ in range(ITERATIONS):
             before = np.concatenate([mounts, rig])
-            mounts, rig = take_step(points, observed, images, levels, mounts, rig)
+            stepped = take_step(points, observed, images, levels, mounts, rig)
+            # All points that views see may lie at the very border of the images, where they cannot be compared.
+            if stepped is None:
+                return None
+            mounts, rig = stepped
             if np.abs(np.concatenate([mounts, rig]) - before).max() < SMALLEST_STEP:
                 break
     return mounts, rig

@@ -14,7 +14,7 @@ from genre_tasks.scene_edits.actor_names import resolve_actor
 from genre_tasks.scene_edits.actor_parts import ActorPart, extract_part
 from genre_tasks.scene_edits.chunk_scene import SceneSource
 from genre_tasks.scene_edits.run_survey import RunSurvey, Track, survey_run
-from genre_tasks.scene_edits.symmetry import complete_by_symmetry
+from genre_tasks.scene_edits.symmetry import complete_by_symmetry, complete_points_by_symmetry
 from genre_tasks.scene_edits.tone import measure_road_color
 
 _MAX_CLEARANCE_M = 0.5
@@ -27,7 +27,7 @@ class LibraryActor:
     Attributes:
         track: its recorded path.
         part: its Gaussians, of the chunk that has most of them; the side that no camera saw is mirrored.
-        points: its LiDAR points in that chunk.
+        points: its LiDAR points in that chunk, mirrored as its Gaussians are.
         chunk: number of that chunk.
         shape_frames: [F] the log frames in which that chunk has it.
         clearance_m: from the ground to the bottom of its box, the median over its path.
@@ -98,10 +98,13 @@ def take_actor(source: SceneSource, survey: RunSurvey, track_id: str) -> Library
     chunk_scene = source.load(chunk_number)
     number = next(k for k, a in enumerate(chunk_scene.scene.actors) if a.track_id == track_id)
     node = chunk_scene.scene.actors[number]
+    part = extract_part(chunk_scene.scene, number)
+    views = chunk_scene.chunk.views
+    points = chunk_scene.chunk.actors[number].points
     return LibraryActor(
         track=track,
-        part=complete_by_symmetry(extract_part(chunk_scene.scene, number), node, chunk_scene.chunk.views),
-        points=chunk_scene.chunk.actors[number].points,
+        part=complete_by_symmetry(part, node, views),
+        points=complete_points_by_symmetry(points, node, views, deforms=part.deformation is not None),
         chunk=chunk_number,
         shape_frames=node.frames.astype(np.float64),
         clearance_m=measure_clearance(survey, track),

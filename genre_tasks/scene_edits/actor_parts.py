@@ -31,11 +31,13 @@ class ActorPart:
         gaussians: M of them.
         spherical_harmonics: [M, K, 3] in the box, or none.
         deformation: of this actor alone, as number 0; ``None``: it is rigid.
+        shadow_count: how many of the Gaussians are its contact shadow, the last ones.
     """
 
     gaussians: Gaussians
     spherical_harmonics: Tensor | None
     deformation: Deformation | None
+    shadow_count: int = 0
 
     def __len__(self) -> int:
         return len(self.gaussians)
@@ -168,19 +170,18 @@ def trim_to_box(part: ActorPart, size_m: tuple[float, float, float]) -> ActorPar
     )
 
 
-def join_parts(first: ActorPart, second: Gaussians) -> ActorPart:
-    """Adds Gaussians to an actor's, which look the same from all sides.
+def add_shadow(part: ActorPart, shadow: Gaussians) -> ActorPart:
+    """Adds a contact shadow to an actor, as its last Gaussians.
 
     Args:
-        first: the actor.
-        second: in the same box.
+        part: the actor, without a shadow.
+        shadow: Gaussians in the same box, which look the same from all sides.
     """
-    harmonics = first.spherical_harmonics
+    harmonics = part.spherical_harmonics
     if harmonics is not None:
-        harmonics = torch.cat([harmonics, harmonics.new_zeros(len(second), *harmonics.shape[1:])])
-    return ActorPart(
-        map_attributes(lambda a, b: torch.cat([a, b]), first.gaussians, second), harmonics, first.deformation
-    )
+        harmonics = torch.cat([harmonics, harmonics.new_zeros(len(shadow), *harmonics.shape[1:])])
+    gaussians = map_attributes(lambda a, b: torch.cat([a, b]), part.gaussians, shadow)
+    return ActorPart(gaussians, harmonics, part.deformation, len(shadow))
 
 
 def _join_harmonics(scene: SceneGraph, rows: Tensor, parts: Sequence[ActorPart]) -> Tensor | None:

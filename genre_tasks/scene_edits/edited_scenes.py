@@ -19,9 +19,9 @@ from genre_tasks.scene_edits.actor_names import make_slug, resolve_actor
 from genre_tasks.scene_edits.actor_parts import (
     ActorPart,
     PlacedActor,
+    add_shadow,
     assemble_edited_scene,
     extract_part,
-    join_parts,
     select_deformation,
     trim_to_box,
 )
@@ -30,7 +30,7 @@ from genre_tasks.scene_edits.contact_shadow import build_contact_shadow
 from genre_tasks.scene_edits.edits import ActorChange, EditList, Insert, Remove, combine_changes
 from genre_tasks.scene_edits.insertion import place_inserted
 from genre_tasks.scene_edits.run_survey import survey_run
-from genre_tasks.scene_edits.symmetry import complete_by_symmetry
+from genre_tasks.scene_edits.symmetry import complete_by_symmetry, complete_points_by_symmetry
 from genre_tasks.scene_edits.tone import apply_tone, match_tone, measure_road_color
 from genre_tasks.scene_edits.trajectories import Trajectory, change_trajectory
 
@@ -112,6 +112,11 @@ class EditedScenes:
         """Numbers of the chunks that are shown, in the order of the log."""
         return self._numbers
 
+    @property
+    def changed_names(self) -> dict[str, str]:
+        """Readable names of the recorded actors that edits take away or change, by track id."""
+        return {track_id: self.names[track_id] for track_id in self._changed}
+
     def load(self, number: int) -> ChunkScene:
         """Reads one chunk and its scene, and edits them; the last two stay in memory.
 
@@ -135,10 +140,8 @@ class EditedScenes:
             actor = self._place_recorded(base, k)
             if actor is not None:
                 placed.append(actor)
-                recorded = base.chunk.actors[k]
                 # An actor that no edit names keeps its very arrays.
-                changed = replace(recorded, frames=actor.node.frames, chunk_SE3_box=actor.node.chunk_SE3_box)
-                actors.append(recorded if actor.node is node else changed)
+                actors.append(base.chunk.actors[k] if actor.node is node else self._move_recorded(actor.node, base, k))
         for actor, points in new:
             placed.append(actor)
             node = actor.node
@@ -147,6 +150,7 @@ class EditedScenes:
             chunk=replace(base.chunk, actors=tuple(actors)),
             scene=assemble_edited_scene(base.scene, placed),
             removed=(*base.removed, *removed),
+            shadow_counts={a.node.track_id: a.part.shadow_count for a in placed if a.part is not None},
         )
 
     def _place_recorded(self, base: ChunkScene, k: int) -> PlacedActor | None:
@@ -200,7 +204,7 @@ class EditedScenes:
             shadow = build_contact_shadow(actor.track.size_m, clearance, self._config.contact_shadow)
             node = _cut_node(inserted.name, actor.track.label, actor.track.size_m, trajectory, base)
             out.append(
-                (_new_actor(node, trajectory, join_parts(trim_to_box(part, actor.track.size_m), shadow)), actor.points)
+                (_new_actor(node, trajectory, add_shadow(trim_to_box(part, actor.track.size_m), shadow)), actor.points)
             )
         return out
 
@@ -210,11 +214,20 @@ class EditedScenes:
         # An actor that is not turned shows the side that it showed before.
         return complete_by_symmetry(part, base.scene.actors[k], base.chunk.views) if change.turn_deg else part
 
+    def _move_recorded(self, node: ActorNode, base: ChunkScene, k: int) -> Actor:
+        """A recorded actor of the chunk on its new path; its points show the sides that its Gaussians show."""
+        recorded = base.chunk.actors[k]
+        points = recorded.points
+        if self._changed[node.track_id].change.turn_deg:
+            deforms = select_deformation(base.scene.deformation, k) is not None
+            points = complete_points_by_symmetry(points, base.scene.actors[k], base.chunk.views, deforms=deforms)
+        return replace(recorded, frames=node.frames, chunk_SE3_box=node.chunk_SE3_box, points=points)
+
     def _with_shadow(self, changed: _ChangedActor, part: ActorPart) -> ActorPart:
         track = self._survey.tracks[changed.track_id]
         clearance = measure_clearance(self._survey, track) + float(changed.change.up_m)
         shadow = build_contact_shadow(track.size_m, clearance, self._config.contact_shadow)
-        return join_parts(trim_to_box(part, track.size_m), shadow)
+        return add_shadow(trim_to_box(part, track.size_m), shadow)
 
     def _change(self, track_id: str, change: ActorChange) -> _ChangedActor:
         if change.removed:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from genre_tasks.config import IngestConfig
 from genre_tasks.errors import InputError
 from genre_tasks.logs.types import DrivingLog, Float64
@@ -69,3 +71,22 @@ class ChunkReading:
             The error, to be raised.
         """
         return InputError(problem, remedy=remedy, log=self.log.name, chunk=self.chunk, camera=camera, frame=frame)
+
+    def explain_long_path(self, error: InputError) -> InputError:
+        """Adds to an error about the length of the path where that comes from.
+
+        Args:
+            error: of a step that lays a grid along the path.
+
+        Returns:
+            The error with log, chunk and the frame whose pose lies farthest from the middle, to be raised.
+        """
+        path = self.chunk_SE3_ego[:, :2, 3]
+        # The median: a mean would follow a single wrong pose.
+        distance_m = np.linalg.norm(path - np.median(path, axis=0), axis=1)
+        farthest = int(distance_m.argmax())
+        return self.input_error(
+            f"{error.problem}, and this frame lies {distance_m[farthest]:.0f} m from its median position",
+            "Correct the pose of this frame, leave the chunk out with --chunks, or set a smaller ingest.chunk_frames.",
+            frame=self.frames[farthest],
+        )

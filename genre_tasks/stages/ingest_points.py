@@ -131,7 +131,8 @@ def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> C
         Background and actors; actors with too few points or frames are left out.
 
     Raises:
-        InputError: the chunk has no sweep with points, or under ``strict`` one is missing or unreadable.
+        InputError: the chunk has no sweep with points, a pose is far away, or under ``strict`` a sweep is missing or
+            unreadable.
     """
     moving = _select_actors(reading)
     background: list[FramePoints] = []
@@ -157,7 +158,11 @@ def read_points_from_sweeps(reading: ChunkReading, sources: Sequence[View]) -> C
         raise _describe_no_points(reading, has_sweeps=bool(background))
     # Completion looks at measured points alone; road points that it adds do not take part in completing façades.
     swept = np.concatenate([points for _, points in background])
-    background.append((NO_SWEEP, complete_road(swept, reading.chunk_SE3_ego)))
+    try:
+        road = complete_road(swept, reading.chunk_SE3_ego)
+    except InputError as error:
+        raise reading.explain_long_path(error) from error
+    background.append((NO_SWEEP, road))
     if reading.config.complete_facades:
         background.append((NO_SWEEP, complete_facades(swept, reading.chunk_SE3_ego, sources)))
     return ChunkPoints(_join(background, None), _build_actor_clouds(reading, moving.tracks, points_of_track))

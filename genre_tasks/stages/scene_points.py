@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from genre_tasks.errors import InputError
 from genre_tasks.fixer.view_surface import unproject_surface
 from genre_tasks.logs.types import Float32
 from genre_tasks.render.surface import render_surfaces
@@ -69,7 +70,7 @@ def read_points_from_scene(reading: ChunkReading, file: str, views: Sequence[Vie
         A background without actors; a point's frame is that of its view, and points that complete the road have none.
 
     Raises:
-        InputError: the file cannot be read, or the views see next to nothing of it.
+        InputError: the file cannot be read, the views see next to nothing of it, or a pose is far away.
     """
     scene = read_placed_scene(file, reading.config.placement, reading.world_SE3_chunk)
     opaque = _sharpen_opacities(scene)
@@ -95,8 +96,11 @@ def read_points_from_scene(reading: ChunkReading, file: str, views: Sequence[Vie
     frames = np.repeat(np.array([view.frame for view in views], np.int16), [len(part) for part in parts])
     detail = f"there is no LiDAR: {len(positions)} points are of the depth of the scene that is to be enhanced"
     reading.add_issue("depth_of_scene", detail)
-    positions = smooth_road(positions, _select_agreed(positions, frames), reading.chunk_SE3_ego)
-    road = complete_road(_select_agreed(positions, frames), reading.chunk_SE3_ego)
+    try:
+        positions = smooth_road(positions, _select_agreed(positions, frames), reading.chunk_SE3_ego)
+        road = complete_road(_select_agreed(positions, frames), reading.chunk_SE3_ego)
+    except InputError as error:
+        raise reading.explain_long_path(error) from error
     frames = np.concatenate([frames, np.full(len(road), NO_SWEEP, np.int16)])
     return ChunkPoints(PointCloud(np.concatenate([positions, road]), frames), [])
 

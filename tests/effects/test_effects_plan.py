@@ -222,9 +222,20 @@ def test_pedestrians_count_by_their_area() -> None:
     area = view.lens.width_px * view.lens.height_px
     per_m2 = view.lens.fx_px * view.lens.fy_px / 100 / area * 100  # percent
     limit = (load_effect("nonrigid_actors").threshold / per_m2) ** 0.5
-    assert planned("nonrigid_actors", sized(0.97 * limit, "Pedestrian"))["nonrigid_actors"].choice == "off"
-    assert planned("nonrigid_actors", sized(1.03 * limit, "Pedestrian"))["nonrigid_actors"].choice == "on"
-    assert planned("nonrigid_actors", sized(3 * limit, "Car"))["nonrigid_actors"].choice == "off"
+    with_nodes = only("nonrigid_actors").model_copy(update={"rigid_actors": "on"})
+    for factor, label, choice in ((0.97, "Pedestrian", "off"), (1.03, "Pedestrian", "on"), (3, "Car", "off")):
+        found = plan_effects(with_nodes, sized(factor * limit, label), cameras())["nonrigid_actors"]
+        assert found.choice == choice
+    # Without nodes of their own there is nothing that could change its shape.
+    crowded = sized(1.03 * limit, "Pedestrian")
+    alone = planned("nonrigid_actors", crowded)["nonrigid_actors"]
+    assert alone.choice == "off" and alone.value > alone.threshold
+    assert alone.reason.startswith("rigid_actors, which it needs, is off; ")
+    with pytest.raises(ConfigError, match=r"nonrigid_actors is set on, and rigid_actors.*effects.rigid_actors to on"):
+        plan_effects(only("nonrigid_actors", setting="on"), crowded, cameras())
+    # A chunk without any is no error: it has nothing to miss.
+    empty = replace(crowded, actors=())
+    assert plan_effects(only("nonrigid_actors", setting="on"), empty, cameras())["nonrigid_actors"].choice == "on"
 
 
 def test_without_lidar_the_depth_term_is_off_and_all_is_distant() -> None:

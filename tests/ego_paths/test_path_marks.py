@@ -112,6 +112,27 @@ def test_a_relative_path_has_the_marks_that_it_was_stated_with() -> None:
     assert np.abs(driven - 0.5 * (yaw[1:] + yaw[:-1])).max() < 0.03
 
 
+def test_a_relative_path_steers_the_same_however_dense_its_poses_are() -> None:
+    def place(rate_hz: float) -> EgoPath:
+        times = np.arange(round(2.0 * rate_hz) + 1) / rate_hz
+        # A lane change of 3 m within two seconds.
+        return place_relative_path(CURVE, times, 10 * times, 1.5 * (1 - np.cos(np.pi * times / 2.0)), 0 * times)
+
+    sparse = yaw_of(place(10.0))
+    dense = yaw_of(place(1000.0))[::100]
+    # Inside of both ends, where differences are one-sided.
+    assert dense[1:-1] == pytest.approx(sparse[1:-1], abs=0.01)
+    along = yaw_of(place_relative_path(CURVE, 0.1 * np.arange(21), np.arange(21.0), np.zeros(21), np.zeros(21)))
+    assert np.abs(dense - along).max() > 0.2
+
+
+def test_a_standing_vehicle_does_not_turn_for_going_sideways() -> None:
+    times = 0.02 * np.arange(50)
+    # It falls back as fast as the recorded vehicle drives, but for half of the speed that counts as driving.
+    path = place_relative_path(CURVE, times, 10 * times + 10, 0.5 * times, -7.95 * times)
+    assert np.ptp(yaw_of(path)) < 0.01
+
+
 @pytest.mark.parametrize(
     ("lateral_m", "ahead_m", "problem"),
     [(0.0, -6.0, r"pose 0 of the path is 6\.0 m before the first"), (26.0, 0.0, "past the centre of the curve")],

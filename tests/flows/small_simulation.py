@@ -19,14 +19,14 @@ SETTINGS = (
 CHUNKS = (0, 1)
 
 
-def make_run(store: Path) -> str:
+def make_run(store: Path, log: str = LOG, settings: tuple[str, ...] = ()) -> str:
     """Ingests two chunks and makes their initial scenes; the run's name."""
-    config = load_configuration("demo", settings=SETTINGS).model_dump(mode="json")
+    config = load_configuration("demo", settings=(*SETTINGS, *settings)).model_dump(mode="json")
     chunks: dict[int, dict[str, ArtifactRef]] = {}
     for chunk in CHUNKS:
         refs: dict[str, ArtifactRef] = {}
         for stage in ("ingest", "effects", "initial"):
-            refs[stage] = run_stage(stage, Job(LOG, chunk, str(store), config), refs)
+            refs[stage] = run_stage(stage, Job(log, chunk, str(store), config), refs)
         chunks[chunk] = refs
-    run = FinishedRun(log=LOG, preset="demo", store=str(store), config=config, differs={}, chunks=chunks)
+    run = FinishedRun(log=log, preset="demo", store=str(store), config=config, differs={}, chunks=chunks)
     return str(write_run_record(run, summarise_run(run), {})["run"])

@@ -205,6 +205,37 @@ def test_dense_scenes_are_not_split(inputs: EnhancementInputs) -> None:
     assert not any(setting.startswith("enet.") for setting in sparse.settings)
 
 
+@pytest.mark.parametrize("lidar", [False, True])
+def test_poses_and_colours_stay_those_of_the_scene(inputs: EnhancementInputs, folder: Path, lidar: bool) -> None:
+    inputs = replace(inputs, lidar=folder / "points.ply" if lidar else None)
+    prepared = prepare_enhancement(inputs, load_configuration("demo"))
+    kept = ("pose_refinement", "anti_aliasing", "view_dependent_colour")
+    effects = load_configuration("demo", settings=prepared.settings).effects
+    assert [getattr(effects, name) for name in kept] == ["off"] * 3
+    assert effects.exposure == "auto"
+    assert any("effects.pose_refinement=on" in line for line in prepared.explanation)
+
+
+def test_who_wants_poses_refined_sets_it(inputs: EnhancementInputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[RunRequest] = []
+    monkeypatch.setattr(cli_enhance, "check_request", lambda request: None)
+    monkeypatch.setattr(cli_enhance, "reconstruct", lambda request, as_json: asked.append(request))
+    words = ["enhance", str(inputs.scene), "--cameras", str(inputs.cameras), "--scale", "2.5"]
+    for more in ([], ["--set", "effects.pose_refinement=on"]):
+        CliRunner().invoke(app, [*words, *more], catch_exceptions=False)
+    assert [request.config.effects.pose_refinement for request in asked] == ["off", "on"]
+
+
+def test_effects_that_a_scene_cannot_have_are_refused(inputs: EnhancementInputs, tmp_path: Path) -> None:
+    words = ["enhance", str(inputs.scene), "--cameras", str(inputs.cameras), "--scale", "2.5", "--preset", "demo"]
+    for setting, reason in {
+        "effects.anti_aliasing=on": "anti_aliasing is set on, and initial.scene leaves it out",
+        "effects.view_dependent_colour=on": "view_dependent_colour is set on, and gnet.method=none leaves it out",
+    }.items():
+        done = CliRunner().invoke(app, [*words, "--store", str(tmp_path), "--set", setting, "--dry-run"])
+        assert isinstance(done.exception, ConfigError) and reason in done.exception.problem
+
+
 # --- the file
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import sys
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.errors import DiskFullError, GenreError, InputError
 from genre_tasks.exchange.registry import load_format
-from genre_tasks.exchange.scene_folder import read_document
+from genre_tasks.exchange.scene_folder import SCENE_FILE, read_document
 from genre_tasks.scene_edits.actor_names import name_actors
 from genre_tasks.scene_edits.edits import EditList, Insert, Move
 from genre_tasks.scene_edits.run_survey import survey_run
@@ -46,13 +47,44 @@ def test_files_that_were_edited_are_not_overwritten(run: ExportRequest, tmp_path
     edited = out / "chunk-0" / "background.ply"
     edited.write_bytes(b"hours of work")
     again = replace(run, out=out, chunks=(1,), overwrite=True)
-    with pytest.raises(InputError, match=r"after the export: chunk-0/background\.ply \(.*Move these files"):
+    with pytest.raises(InputError, match=r"after the export: chunk-0/background\.ply \(.*Move these files away"):
         export_scenes(again)
     assert edited.read_bytes() == b"hours of work"
     # Of a file that is not there nothing can be lost.
     edited.rename(tmp_path / "background.ply")
     assert export_scenes(again)["chunks"] == [1]
     assert [path.name for path in out.iterdir() if path.is_dir()] == ["chunk-1"]
+
+
+@pytest.mark.parametrize("name", ["ply", "alpasim"])
+def test_a_document_that_was_edited_is_not_overwritten(run: ExportRequest, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "out"
+    again = replace(run, format=name, out=out, overwrite=True)
+    export_scenes(again)
+    # As it was written it may be replaced.
+    export_scenes(again)
+    document = (out / SCENE_FILE).read_text()
+    for edited in (document.replace("background", "street", 1), document.replace("\n", ""), document + " "):
+        assert edited != document
+        (out / SCENE_FILE).write_text(edited)
+        with pytest.raises(InputError, match=r"after the export: scene\.json \(.*Move the folder away"):
+            export_scenes(again)
+        assert (out / SCENE_FILE).read_text() == edited
+    # Earlier versions wrote no digest: nobody knows whether such a document was changed.
+    earlier = json.loads(document)
+    del earlier["document_sha256"]
+    (out / SCENE_FILE).write_text(json.dumps(earlier))
+    export_scenes(again)
+    assert (out / SCENE_FILE).read_text() == document
+
+
+def test_a_document_that_is_a_link_is_not_overwritten(run: ExportRequest, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export_scenes(replace(run, out=out))
+    (out / SCENE_FILE).rename(tmp_path / "mine.json")
+    (out / SCENE_FILE).symlink_to(tmp_path / "mine.json")
+    with pytest.raises(InputError, match=r"after the export: scene\.json"):
+        export_scenes(replace(run, out=out, overwrite=True))
 
 
 def test_a_link_in_the_place_of_a_file_counts_as_an_edit(run: ExportRequest, tmp_path: Path) -> None:
@@ -102,6 +134,31 @@ def read_frames(request: ExportRequest) -> tuple[int, ...]:
     """Exports by nodes, all of which are counted; the frames."""
     assert export_scenes(request)["gaussians"] == 76
     return read_document(request.out).chunks[0].frames
+
+
+# --- what is lost
+
+
+@pytest.mark.parametrize(("name", "words"), [("spz", "rounded to a quarter"), ("splat", "rounded to 256 steps")])
+def test_what_files_have_rounded_is_named_ever_after(run: ExportRequest, tmp_path: Path, name: str, words: str) -> None:
+    export_scenes(replace(run, format=name, out=tmp_path / "lossy"))
+    store = str(tmp_path / "store")
+    record = import_scene(store, tmp_path / "lossy", "street")
+    assert [sum(words in loss for loss in chunk["losses"]) for chunk in record["chunks"]] == [1, 1]
+    for again in ("ply", name, "usdz", "glb"):
+        out = tmp_path / again
+        export_scenes(ExportRequest(store=store, scene="street", format=again, out=out))
+        # Once, also where they are rounded a second time.
+        assert sum(words in loss for loss in read_document(out).losses) == 1
+    # PLY loses nothing further, and keeps the list.
+    further = import_scene(store, tmp_path / "ply", "further")
+    assert [chunk["losses"] for chunk in further["chunks"]] == [chunk["losses"] for chunk in record["chunks"]]
+
+
+def test_files_that_round_nothing_leave_no_loss(run: ExportRequest, tmp_path: Path) -> None:
+    export_scenes(replace(run, out=tmp_path / "out"))
+    record = import_scene(str(tmp_path / "store"), tmp_path / "out")
+    assert not [loss for chunk in record["chunks"] for loss in chunk["losses"] if "rounded" in loss]
 
 
 # --- what errors say

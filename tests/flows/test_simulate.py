@@ -20,6 +20,7 @@ from flows.cli.simulate_options import read_request
 from flows.configuration.loading import apply_settings
 from flows.simulation import parked_actors, stored_ranges
 from flows.simulation import simulate as simulate_module
+from flows.simulation.chunk_outlines import load_outlines
 from flows.simulation.edit_file import parse_edit_options
 from flows.simulation.edited_runs import open_edited_scenes, open_run, write_edited_run
 from flows.simulation.film import FilmWriter
@@ -31,7 +32,7 @@ from flows.simulation.simulate import simulate_run
 from genre_tasks.config import PipelineConfig, SimulateConfig
 from genre_tasks.ego_paths import recorded_path
 from genre_tasks.ego_paths.recorded_path import ImageTime, join_recorded_path, list_image_times
-from genre_tasks.errors import ConfigError, GenreError, InputError
+from genre_tasks.errors import ConfigError, DiskFullError, GenreError, InputError
 from genre_tasks.logs.synthetic import SyntheticStreet
 from genre_tasks.rollout.handover import plan_handovers
 from genre_tasks.rollout.render_rollout import render_rollout
@@ -212,13 +213,14 @@ def test_an_interrupted_simulation_leaves_nothing(
         simulate_run(replace(recorded, out=tmp_path / "out"), stop)
     assert not list(tmp_path.iterdir())
 
-    def fail(*args: object) -> None:
-        raise OSError(28, "No space left on device", "metrics.json")
+    def fail(folder: Path, metrics: object) -> None:
+        raise OSError(28, "No space left on device", str(folder / "metrics.json"))
 
     # The same at the very end, when films are complete already.
     monkeypatch.setattr(simulate_module, "write_metrics", fail)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(DiskFullError) as caught:
         simulate_run(replace(recorded, out=tmp_path / "out", cameras=("front_camera",)))
+    assert caught.value.file == str(tmp_path / "out") and "--out" in caught.value.remedy
     assert not list(tmp_path.iterdir())
 
 
@@ -334,7 +336,8 @@ def test_a_log_whose_boxes_cannot_be_read_has_no_parked_vehicles(
         raise InputError("row 0 is of frame 999", remedy="Correct the boxes.")
 
     monkeypatch.setattr(SyntheticStreet, "tracks", fail)
-    assert parked_actors.list_parked(RunScenes(recorded.store, recorded.run)) == ()
+    scenes = RunScenes(recorded.store, recorded.run)
+    assert parked_actors.list_parked(scenes, load_outlines(scenes)) == ()
     done = simulate_run(replace(recorded, out=tmp_path / "out", cameras=("front_camera",)))
     assert any("its boxes cannot be read" in warning for warning in done["warnings"])
 

@@ -24,7 +24,8 @@ from flows.pipeline.stage_runner import run_stage
 from genre_tasks.config import SimulateConfig
 from genre_tasks.ego_paths.ego_path import EgoPath
 from genre_tasks.ego_paths.world_actors import WorldActor
-from genre_tasks.errors import ConfigError
+from genre_tasks.errors import ConfigError, InputError
+from genre_tasks.logs.synthetic import SyntheticStreet
 from tests.faults.small_run import SETTINGS
 
 LOG = "synthetic:street?seed=900&frames=8&cameras=1&width=64&height=36&lidar_beams=32&lidar_azimuths=300"
@@ -121,6 +122,10 @@ def test_a_behaviours_number_is_the_mean_of_both_sides() -> None:
     assert "swerve/kernel" not in values and "brake/psnr" not in values
 
 
+def refuse_boxes(log: object) -> tuple[object, ...]:
+    raise InputError("row 0 is of frame 999", remedy="Correct the boxes.")
+
+
 def test_table_6_has_a_cell_for_all_chunks_of_a_log_and_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,6 +139,13 @@ def test_table_6_has_a_cell_for_all_chunks_of_a_log_and_goes_on_where_it_was(
     assert cell.chunk is None and cell.seconds["gnet"] > 0
     left, right = cell.metrics["brake_left/psnr"], cell.metrics["brake_right/psnr"]
     assert left != right and cell.metrics["brake/psnr"] == pytest.approx((left + right) / 2)
+    # A log whose boxes cannot be read has scenes, and so a cell that says what it lacks.
+    with monkeypatch.context() as patched:
+        patched.setattr(SyntheticStreet, "tracks", refuse_boxes)
+        unchecked = measure_rollout_cell(basis, layout, method, places, run_stage)
+    assert math.isfinite(unchecked.metrics["brake/psnr"])
+    lacks = f"the boxes of {LOG} cannot be read: no path was checked against parked vehicles"
+    assert unchecked.remarks.count(lacks) == 1 and lacks not in cell.remarks
     # Every second of eight poses, one camera.
     assert cell.metrics["brake_left/psnr/n"] == 4 and cell.metrics["brake_left/kernel/n"] == 4
     assert math.isfinite(cell.metrics["brake/kernel"]) and 5 < left < 60

@@ -23,6 +23,12 @@ def with_camera_clock(change: Callable[[float], float], start_s: float = START_S
     return assess(EditedLog(log, camera_timestamp_s=lambda camera, frame: change(times[frame])))
 
 
+def with_offset(times: tuple[float, ...], offset_s: float) -> dict[str, Finding]:
+    """What is found where cameras fire so long after their sweeps."""
+    log = street(timestamps_s=times, without_tracks=True, no_lidar=True, speed_mps=0.0, frame_count=len(times))
+    return assess(EditedLog(log, camera_timestamp_s=lambda camera, frame: times[frame] + offset_s))
+
+
 def with_times(*times: float) -> dict[str, Finding]:
     log = street(timestamps_s=times, without_tracks=True, no_lidar=True, speed_mps=0.0, frame_count=len(times))
     return assess(log)
@@ -39,6 +45,33 @@ def test_the_remedy_of_a_wrong_unit_holds_for_every_reader() -> None:
 def test_cameras_fire_within_a_frame(delay_s: float) -> None:
     """Report: argoverse/av2-api#112 has an image 147 ms from its sweep."""
     assert with_camera_clock(lambda time: time + delay_s) == {}
+
+
+@pytest.mark.parametrize(
+    ("period_s", "plausible_s", "late_s"),
+    [(0.05, 0.07, 0.078125), (0.1, 0.147, 0.15625), (0.5, 0.7, 0.78125), (1.0, 1.45, 1.5625)],
+)
+def test_how_far_images_may_be_follows_the_rate_of_sweeps(period_s: float, plausible_s: float, late_s: float) -> None:
+    """Key frames are at 2 Hz, and some LiDARs turn at 20 Hz. No report."""
+    # Lateness is in binary fractions, which times since 1970 keep to the last digit.
+    times = tuple(START_S + period_s * k for k in range(8))
+    assert with_offset(times, plausible_s) == with_offset(times, -plausible_s) == {}
+    found = with_offset(times, late_s)
+    assert set(found) == {"camera_clock"} and f"always by {late_s:g} s" in found["camera_clock"].message
+    assert found["camera_clock"].numbers["limit_s"] == pytest.approx(1.5 * period_s, rel=1e-4)
+    assert f"over {1.5 * period_s:.3g} s from their sweep" in found["camera_clock"].message
+
+
+def test_dropped_sweeps_do_not_change_how_far_images_may_be() -> None:
+    """Report: tier4/tier4_perception_dataset#58 (dropped LiDAR frames)."""
+    times = tuple(START_S + 0.1 * k for k in (0, 1, 2, 5, 6, 7, 8, 12))
+    assert set(with_offset(times, 0.14)) == {"dropped_frames"}
+    assert set(with_offset(times, 0.2)) == {"dropped_frames", "camera_clock"}
+
+
+def test_a_single_sweep_has_the_limit_of_the_usual_rate() -> None:
+    assert "camera_clock" not in with_offset((START_S,), 0.14)
+    assert with_offset((START_S,), 0.2)["camera_clock"].numbers["limit_s"] == 0.15
 
 
 @pytest.mark.parametrize(

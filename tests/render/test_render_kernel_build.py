@@ -18,10 +18,10 @@ from genre_tasks.errors import ConfigError, ResourceError
 from genre_tasks.logs.types import RollingShutter
 from genre_tasks.losses import build_image_loss
 from genre_tasks.optimiser.kernels import build_network, build_posing
-from genre_tasks.render import RenderSettings, constants, cpu, render
+from genre_tasks.render import RenderSettings, constants, cpu, cuda, render
 from genre_tasks.render.kernel import library
 from genre_tasks.render.kernel.build import KERNEL
-from genre_tasks.render.types import Shutter
+from genre_tasks.render.types import Shutter, VisibleRanges
 
 
 @pytest.fixture
@@ -144,6 +144,33 @@ def test_cuda_without_gsplat_says_how_to_get_it(scene):
         pytest.skip("gsplat is installed")
     with pytest.raises(ResourceError, match=r"needs gsplat.*\[cuda\]"):
         render(*scene(5), RenderSettings("cuda"))
+
+
+@pytest.mark.parametrize(("gaussians", "views"), [(0, 2), (5, 0), (0, 0)])
+def test_cuda_is_not_asked_for_nothing(scene, monkeypatch, gaussians, views):
+    monkeypatch.setattr(cuda, "render_cuda", lambda *_: pytest.fail("asked"))
+    splats, cameras = scene(gaussians, 16, 12, views)
+    # What is not finite gives no gradient that is not finite.
+    splats.means[:1] = torch.nan
+    leaves = [getattr(splats, name).requires_grad_() for name in ("means", "scales", "quats", "opacities", "colors")]
+    leaves.append(cameras.camera_SE3_chunk.requires_grad_())
+    out = render(splats, cameras, RenderSettings("cuda"))
+    assert [tuple(x.shape) for x in (out.color, out.alpha, out.depth)] == [(views, 12, 16, 3), *[(views, 12, 16)] * 2]
+    assert not out.color.any() and not out.alpha.any() and not out.depth.any() and not out.culled
+    (out.color.sum() + out.alpha.sum() + out.depth.sum()).backward()
+    assert all(x.grad is not None and not x.grad.any() for x in leaves)
+
+
+def test_cuda_is_asked_for_views_that_show_something_alone(scene, monkeypatch):
+    def draw(splats, cameras):
+        size = (len(cameras), cameras.height_px, cameras.width_px)
+        assert len(splats) == 3
+        return (torch.ones(*size, 3), torch.ones(size), torch.ones(size)), {}
+
+    monkeypatch.setattr(cuda, "render_cuda", draw)
+    visible = VisibleRanges(0, ((0, 3), (3, 3)))
+    out = render(*scene(3, 16, 12, 2), RenderSettings("cuda"), visible)
+    assert out.alpha.amax((1, 2)).tolist() == [1, 0]
 
 
 def test_cuda_against_the_reference(scene):

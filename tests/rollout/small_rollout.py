@@ -38,20 +38,46 @@ class OneChunk:
         return self.chunk_scene
 
 
+@dataclass(frozen=True)
+class TwoChunks:
+    """A scene source of two chunks."""
+
+    chunk_scenes: tuple[ChunkScene, ...]
+    chunk_numbers: tuple[int, ...] = (0, 1)
+
+    def load(self, number: int) -> ChunkScene:
+        return self.chunk_scenes[number]
+
+
+def reconstruct(frame_count: int, chunk_count: int) -> tuple[ChunkScene, ...]:
+    """The street as recorded, in chunks of 8 frames."""
+    log = FakeLog(frame_count=frame_count, cars=(CAR,), camera_names=("front",))
+    chunks = [ingest(IngestConfig(width_px=64, height_px=40, chunk_frames=8), log, k) for k in range(chunk_count)]
+    scenes = [initial(InitialConfig(max_points=3000, distant_count=200), chunk).scene for chunk in chunks]
+    assert all([actor.track_id for actor in scene.actors] == ["mover"] for scene in scenes)
+    return tuple(ChunkScene(chunk, scene) for chunk, scene in zip(chunks, scenes, strict=True))
+
+
 @cache
 def recorded() -> OneChunk:
     """The street as recorded."""
-    log = FakeLog(frame_count=8, cars=(CAR,), camera_names=("front",))
-    chunk = ingest(IngestConfig(width_px=64, height_px=40), log, 0)
-    scene = initial(InitialConfig(max_points=3000, distant_count=200), chunk).scene
-    assert [a.track_id for a in scene.actors] == ["mover"]
-    return OneChunk(ChunkScene(chunk, scene))
+    return OneChunk(*reconstruct(frame_count=8, chunk_count=1))
+
+
+@cache
+def two_chunks() -> TwoChunks:
+    """The street as recorded, for twice as long."""
+    return TwoChunks(reconstruct(frame_count=16, chunk_count=2))
 
 
 @cache
 def without_car() -> OneChunk:
     """The street without its car."""
-    base = recorded().chunk_scene
+    return OneChunk(remove_car(recorded().chunk_scene))
+
+
+def remove_car(base: ChunkScene) -> ChunkScene:
+    """The chunk without its car."""
     stays = base.scene.nodes < FIRST_ACTOR
     scene = replace(
         base.scene,
@@ -59,7 +85,7 @@ def without_car() -> OneChunk:
         nodes=base.scene.nodes[stays],
         actors=(),
     )
-    return OneChunk(ChunkScene(replace(base.chunk, actors=()), scene, base.scene.actors))
+    return ChunkScene(replace(base.chunk, actors=()), scene, base.scene.actors)
 
 
 def path_at(*frames: float) -> EgoPath:

@@ -7,12 +7,14 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from genre_tasks.config.simulation_sections import SimulateConfig
 from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render.types import RenderSettings
 from genre_tasks.rollout.instance_masks import (
     DISTANT_CLASS,
     EMPTY_CLASS,
     STATIC_CLASS,
+    Masks,
     is_in_view,
     render_masks,
     render_node_weights,
@@ -24,7 +26,9 @@ from genre_tasks.scene.actor_node import ActorNode
 from genre_tasks.scene.gaussians import Gaussians
 from genre_tasks.scene.graph import DISTANT, FIRST_ACTOR, STATIC, SceneGraph
 from genre_tasks.scene_edits.chunk_scene import ChunkScene
+from genre_tasks.scene_edits.edits import Insert
 from tests.lidar_simulation.spinning_lidar import build_chunk
+from tests.scene_edits.edited_runs import MadeRun, draw, edit
 
 LENS = Lens(60.0, 60.0, 32.0, 18.0, 64, 36)
 SETTINGS = RenderSettings("reference")
@@ -165,3 +169,22 @@ def test_flow_leaves_the_readout_out_of_masks_too():
     assert (render_masks(moving, SETTINGS).instances != render_masks(resting, SETTINGS).instances).any()
     flow = compute_flow(moving, read_out(images_at(scene, 1, 0.2)), SETTINGS)
     assert np.array_equal(flow[0].double().numpy(), flow_of(scene, 0.2), equal_nan=True)
+
+
+def test_a_contact_shadow_is_no_part_of_its_actor():
+    run = MadeRun()
+    insert = Insert(actor="a", name="x", ahead_m=9, speed_m_s=0)
+
+    def render(darkness: float) -> tuple[torch.Tensor, Masks]:
+        chunk_scene = edit(run, insert, config=SimulateConfig(contact_shadow=darkness)).load(0)
+        pose = chunk_scene.chunk.views[0].chunk_SE3_camera
+        view = RolloutView("front", 0.0, pose, LENS)
+        nothing = torch.zeros(1, LENS.height_px, LENS.width_px)
+        images = RolloutImages(0, (view,), chunk_scene, nothing[..., None], nothing, nothing)
+        return draw(chunk_scene), render_masks(images, RenderSettings(threads=1))
+
+    bare_color, bare = render(0.0)
+    shaded_color, shaded = render(0.9)
+    assert (bare_color - shaded_color).max() > 0.05
+    assert (bare.instances == 3).sum() > 20
+    assert torch.equal(shaded.instances, bare.instances) and torch.equal(shaded.classes, bare.classes)

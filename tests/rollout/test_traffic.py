@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from genre_tasks.ego_paths.ego_path import EgoPath
@@ -106,15 +107,60 @@ def test_what_was_removed_from_either_chunk_is_known() -> None:
     assert [track.track_id for track in extend_traffic(*removed).removed] == ["a", "c"]
 
 
+def test_contact_shadows_stay_known_as_such() -> None:
+    shaded = [replace(part, shadow_counts={"b": 1, name: 1}) for part, name in ((BEFORE, "a"), (AFTER, "c"))]
+    assert extend_traffic(*shaded).find_shadows().tolist() == [False] * 3 + [True] * 3
+    assert compose_scene(*shaded).find_shadows().tolist() == [False] * 3 + [True] * 2
+    assert compose_scene(shaded[1], BEFORE).find_shadows().tolist() == [False] * 5
+
+
 def test_a_standing_vehicle_is_at_the_place_of_its_moment() -> None:
     positions = np.array([[0.0, 0.0], [1.0, 0.0], [1.001, 0.0], [1.0, 0.0], [2.0, 0.0]])
-    layout = ChunkLayout((0, 1), (0, 3), (2, 4), np.arange(5.0), positions)
+    facings = np.tile([1.0, 0.0], (5, 1))
+    layout = ChunkLayout((0, 1), (0, 3), (2, 4), np.arange(5.0), positions, facings)
     # A path beside the recorded one that stands at x = 1 all the time.
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, :2, 3] = (1.0, 3.0)
     places = layout.find_places(EgoPath(np.arange(5.0) / 10, np.arange(5.0), poses))
     assert np.allclose(places, [1, 1, 2, 3, 3], atol=0.05)
     assert layout.find_traffic(2) == (0,) and layout.find_traffic(2.4) == (0, 1) and layout.find_traffic(3) == (1,)
+
+
+def make_path(x_m: list[float], y_m: float, frames: list[int], facing: float) -> EgoPath:
+    poses = np.tile(np.eye(4), (len(x_m), 1, 1))
+    poses[:, [0, 1], [0, 1]] = facing
+    poses[:, 0, 3] = x_m
+    poses[:, 1, 3] = y_m
+    return EgoPath(0.1 * np.arange(len(x_m)), np.array(frames, np.float64), poses)
+
+
+def test_a_place_is_in_the_lane_that_the_vehicle_drives_in() -> None:
+    # Out along y = 0, a U-turn at x = 40, and back along y = 6.
+    turn = np.linspace(-np.pi / 2, np.pi / 2, 7)
+    out = np.stack([np.arange(0.0, 40.0, 2.0), np.zeros(20)], 1)
+    arc = np.stack([40 + 3 * np.cos(turn), 3 + 3 * np.sin(turn)], 1)
+    back = np.stack([out[::-1, 0], np.full(20, 6.0)], 1)
+    headings = np.concatenate([np.zeros(20), turn + np.pi / 2, np.full(20, np.pi)])
+    facings = np.stack([np.cos(headings), np.sin(headings)], 1)
+    layout = ChunkLayout((0, 1), (0, 24), (23, 46), np.arange(47.0), np.concatenate([out, arc, back]), facings)
+    x_m = [5.0, 11.0, 20.0, 33.0]
+    frames = [2, 5, 10, 16]
+    # Next to the other lane, whose poses are nearer.
+    assert np.allclose(layout.find_places(make_path(x_m, 5.0, frames, 1.0)), np.array(x_m) / 2)
+    assert np.allclose(layout.find_places(make_path(x_m, 1.0, frames, -1.0)), 46 - np.array(x_m) / 2)
+    # A camera alone does not tell where its vehicle faces.
+    assert layout.find_place(np.array([11.0, 5.0]), 5.0, None) == pytest.approx(40.5)
+
+
+def test_who_turns_around_on_a_straight_street_stays_there() -> None:
+    x = np.arange(0.0, 80.0, 2.0)
+    # Where it ends the street bends back, far away from its beginning.
+    facings = np.tile([1.0, 0.0], (40, 1))
+    facings[-4:] = (-0.2, 0.98)
+    layout = ChunkLayout((0,), (0,), (39,), np.arange(40.0), np.stack([x, np.zeros(40)], 1), facings)
+    x_m = [5.0, 6.0, 20.5]
+    places = [layout.find_places(make_path(x_m, 3.0, [2, 3, 10], facing)) for facing in (1.0, -1.0)]
+    assert np.array_equal(*places) and np.allclose(places[0], np.array(x_m) / 2)
 
 
 def test_fades_of_background_and_traffic() -> None:

@@ -18,7 +18,7 @@ from genre_tasks.effects.plan import EFFECT_NAMES, plan_effects
 from genre_tasks.logs.registry import open_log
 from genre_tasks.logs.synthetic.log import SyntheticStreet
 from genre_tasks.logs.types import Lens
-from genre_tasks.scene import pose_alignment
+from genre_tasks.scene import alignment_step, pose_alignment
 from genre_tasks.scene.alignment_step import AlignedImage, project_points
 from genre_tasks.scene.chunk import Chunk
 from genre_tasks.scene.pose_alignment import PoseAlignment, align_poses
@@ -229,6 +229,20 @@ def test_without_common_points_nothing_is_refined(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(measurements, "align_poses", lambda *_, **__: None)
     decision = plan_effects(ONLY, chunk(EXACT), street(EXACT).cameras)["pose_refinement"]
     assert decision.choice == "off" and "the same LiDAR points" in decision.reason
+
+
+def test_points_at_the_border_of_images_alone_refine_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Wider than the images: points are seen, and none of them is well inside.
+    monkeypatch.setattr(alignment_step, "_BORDER_PX", 10_000)
+    # At the last blur: what is not finite would be found out at the next one.
+    monkeypatch.setattr(pose_alignment, "COARSE_BLURS_PX", (4.0,))
+    monkeypatch.setattr(pose_alignment, "BLURS_PX", (4.0,))
+    for setting, choice in (("auto", "off"), ("on", "on")):
+        config = ONLY.model_copy(update={"pose_refinement": setting})
+        plan = plan_effects(config, chunk(EXACT), street(EXACT).cameras)
+        assert plan["pose_refinement"].choice == choice
+        assert "no two source images see the same LiDAR points" in plan["pose_refinement"].reason
+        assert not plan.parameters.poses
 
 
 def test_the_images_of_one_camera_do_not_move_the_poses_of_an_exact_street() -> None:

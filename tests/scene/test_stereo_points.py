@@ -171,3 +171,7 @@ def test_without_parallax_the_effect_is_off_and_says_why() -> None:
     still = chunk(STREET + "&standstill=1")
     decision = plan_effects(ONLY_STEREO, still, open_log(STREET).cameras)["multi_view_stereo"]
     assert decision.choice == "off" and "from different places" in decision.reason
+
+
+def test_the_stated_cost_holds_for_any_number_of_images() -> None:
+    assert "second" not in multi_view_stereo.EFFECT.cost and "all the others" in multi_view_stereo.EFFECT.cost

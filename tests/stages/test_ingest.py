@@ -313,3 +313,20 @@ def test_without_times_of_sweeps_the_line_of_the_others_goes_on(times: dict[int,
     frames = range(10, 17)
     known = np.array([times.get(frame, np.nan) for frame in frames])
     assert _fill_times(frames, known, np.full(7, np.nan)) == pytest.approx(expected)
+
+
+class LogWithAWrongPose(FakeLog):
+    """Frame 7 lies at the origin of a map."""
+
+    def world_SE3_lidar(self, frame: int) -> np.ndarray:
+        pose = super().world_SE3_lidar(frame)
+        pose[:2, 3] += [-5e5, 4e6] if frame == 7 else [0.0, 0.0]
+        return pose
+
+
+def test_a_pose_far_away_is_named_with_its_frame() -> None:
+    with pytest.raises(InputError, match=r"the chunk.s path spans 4000000 m") as caught:
+        ingest(CONFIG, LogWithAWrongPose(), 0)
+    assert caught.value.where == "log street, chunk 0, frame 7"
+    assert caught.value.problem.endswith("and this frame lies 4031129 m from its median position")
+    assert caught.value.remedy.startswith("Correct the pose of this frame, leave the chunk out")

@@ -15,10 +15,13 @@ from prefect.client.schemas.objects import FlowRun, WorkQueue, WorkQueueStatus
 from prefect.exceptions import ObjectNotFound
 from prefect.states import Completed, Pending, Running, Scheduled
 
-from flows.dataset import server_calls, submission
-from flows.dataset.prefect_runs import DEPLOYMENT
+from flows.dataset import prefect_runs, server_calls, submission
+from flows.dataset.flow import _reconstruct_on_pool
+from flows.dataset.prefect_runs import DEPLOYMENT, ChildRequest
 from flows.dataset.start_watch import StartWatch
 from flows.dataset.submission import PARENT_DEPLOYMENT, Submission, follow_dataset, submit_dataset
+from flows.dataset.supervisor import SupervisionLimits
+from flows.dataset.work_units import WorkUnit
 from genre_tasks.errors import ResourceError
 
 PARAMETERS = {"pool": "genre", "logs": ["kitti:a"]}
@@ -42,7 +45,7 @@ class FakeServer:
 
     def read_deployment_by_name(self, name: str) -> SimpleNamespace:
         assert name in (PARENT_DEPLOYMENT, DEPLOYMENT)
-        return SimpleNamespace(id=uuid4(), work_pool_name="genre")
+        return SimpleNamespace(id=uuid4(), flow_id=uuid4(), work_pool_name="genre", job_variables={})
 
     def read_work_pool(self, name: str) -> SimpleNamespace:
         return SimpleNamespace(name=name)
@@ -132,6 +135,28 @@ def test_a_flow_run_that_is_deleted_while_it_is_followed_is_a_clear_error(server
     with pytest.raises(ResourceError, match=f"flow run {run.id} was deleted") as caught:
         follow_dataset(run.id, lambda rows: server.runs.clear(), poll_s=0.0)
     assert "Run the same command again" in caught.value.remedy
+
+
+def test_a_parent_that_is_deleted_submits_nothing_more(server: FakeServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = FlowRun(flow_id=uuid4(), state=Running())
+    server.runs.append(run)
+    submitted: list[str] = []
+
+    def submit(method: str, path: str, json: dict[str, Any]) -> SimpleNamespace:
+        submitted.append(json["parameters"]["log"])
+        # Somebody deletes the parent, and the run that it has just submitted.
+        server.runs.clear()
+        values = {"id": str(uuid4()), "flow_id": json["flow_id"], "name": json["name"], "tags": json["tags"]}
+        return SimpleNamespace(json=lambda: values | {"state": json["state"]})
+
+    monkeypatch.setattr(server, "request", submit, raising=False)
+    monkeypatch.setattr(prefect_runs, "get_client", lambda sync_client: server)
+    request = ChildRequest("d", str(run.id), "genre", {})
+    limits = SupervisionLimits(in_flight=1, attempts=1, poll_s=0.0)
+    table: Any = SimpleNamespace(show=lambda rows: None)
+    with pytest.raises(ResourceError, match=f"flow run {run.id} was deleted while it ran") as caught:
+        _reconstruct_on_pool(request, [WorkUnit("kitti:a"), WorkUnit("kitti:b")], limits, table)
+    assert submitted == ["kitti:a"] and "Run the same command again" in caught.value.remedy
 
 
 def test_who_follows_a_run_that_does_not_start_is_told_why(

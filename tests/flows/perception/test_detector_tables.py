@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,13 +20,13 @@ from flows.paper_tables.detector_flow import DetectorRequest, render_page
 from flows.paper_tables.detector_study import ROWS
 from flows.paper_tables.flow import write_results
 from flows.paper_tables.request import TableRequest
-from flows.perception.camera_transfer import DetectionPairs, agreement_metrics, list_camera_views
+from flows.perception.camera_transfer import DetectionPairs, agreement_metrics, choose_image_size, list_camera_views
 from flows.pipeline.log_cache import cached_log
 from flows.pipeline.stage_runner import run_stage
 from genre_tasks.detection.detections import Detections
 from genre_tasks.detection3d.detector import load_detector
 from genre_tasks.errors import ConfigError, InputError
-from genre_tasks.logs.types import Lens
+from genre_tasks.logs.types import Camera, Lens
 from tests.faults.small_run import SETTINGS
 
 LOG = "synthetic:street?seed=900&frames=8&cameras=2&width=64&height=36&lidar_beams=32&lidar_azimuths=300"
@@ -121,6 +122,35 @@ def test_a_camera_without_images_is_named() -> None:
     with pytest.raises(InputError, match="no image") as error:
         list_camera_views(Empty(), chunk, "front_left_camera")
     assert error.value.camera == "front_left_camera"
+
+
+@pytest.mark.parametrize(
+    ("width_px", "height_px", "size"),
+    [(1550, 2048, (42, 56)), (2048, 1550, (56, 42)), (1920, 1080, (64, 36)), (32, 18, (64, 36))],
+)
+def test_a_camera_of_another_shape_keeps_its_shape(width_px: int, height_px: int, size: tuple[int, int]) -> None:
+    lens = Lens(1700.0, 1700.0, width_px / 2, height_px / 2, width_px, height_px)
+
+    class Rig:
+        name = "rig"
+        cameras = (Camera("front_left", lens),)
+
+        def image_bytes(self, camera: str, frame: int) -> bytes:
+            return b"image"
+
+        def camera_timestamp_s(self, camera: str, frame: int) -> float:
+            return 0.1 * frame
+
+        def world_SE3_camera(self, camera: str, frame: int) -> NDArray[np.float64]:
+            return np.eye(4)
+
+    chunk = SimpleNamespace(width_px=64, height_px=36, frames=(0, 1), world_SE3_chunk=np.eye(4))
+    assert choose_image_size(lens, chunk) == size
+    views = list_camera_views(Rig(), chunk, "front_left")
+    assert {view.lens for view in views} == {lens.resized(*size)}
+    # Neither road users nor the number of pixels are far from what they are in the training camera.
+    assert views[0].lens.fx_px == pytest.approx(views[0].lens.fy_px, rel=0.02)
+    assert size[0] * size[1] == pytest.approx(64 * 36, rel=0.05)
 
 
 def _read_chunk() -> object:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from genre_tasks.ego_paths.bicycle import BicycleModel
 from genre_tasks.ego_paths.world_actors import WorldActor
 from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs import vehicle_center
+from genre_tasks.rollout.chunk_layout import ChunkLayout
 
 STRAIGHT_ON = np.zeros(2, np.float32)
 
@@ -214,3 +216,20 @@ def test_mistakes_are_named(env: GenreDrivingEnv, served: tuple[str, str]) -> No
         GenreDrivingEnv(*served, render_mode="human")
     with pytest.raises(InputError, match="Did you mean 'front_camera'"):
         GenreDrivingEnv(*served, cameras=["front_camra"], reliable_m=1.0)
+
+
+def test_the_range_is_that_of_the_lane_that_is_driven_in(env: GenreDrivingEnv, monkeypatch: pytest.MonkeyPatch) -> None:
+    world = env._world
+    out = world.recorded.world_SE3_ego
+    # As if the run went on with a way back, 3 m to the left, in a second chunk without any range.
+    positions = np.concatenate([out[:, :2, 3], (out[:, :2, 3] + 3.0 * out[:, :2, 1])[::-1]])
+    facings = np.concatenate([out[:, :2, 0], -out[::-1, :2, 0]])
+    count = len(out)
+    frames = np.arange(2.0 * count)
+    layout = ChunkLayout((0, 1), (0, count), (count - 1, 2 * count - 1), frames, positions, facings)
+    monkeypatch.setattr(world, "_layout", layout)
+    monkeypatch.setattr(world, "_ranges", {0: SideRange(9.0, 9.0), 1: SideRange(0.0, 0.0)})
+    state = world.start(4, 2.5, BicycleModel(world.config.bounds))
+    assert world.locate(state, 4.0, world.find_arc(4)).reliable
+    turned = replace(state, heading_rad=state.heading_rad + np.pi)
+    assert not world.locate(turned, 4.0, world.find_arc(4)).reliable

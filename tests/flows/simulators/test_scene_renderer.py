@@ -20,6 +20,7 @@ from flows.simulators.scene_renderer import SceneRenderer
 from genre_tasks.errors import InputError, ResourceError
 from genre_tasks.logs.types import Float64, Lens, RollingShutter
 from genre_tasks.render import render_views
+from genre_tasks.rollout.chunk_layout import ChunkLayout
 from genre_tasks.rollout.rig import RolloutView
 from genre_tasks.scene.chunk import View
 from genre_tasks.scene.novel_poses import place_novel_views
@@ -70,6 +71,28 @@ def test_recorded_views_are_those_of_genre_render(renderer: SceneRenderer, serve
             assert difference(renderer.render(request), expected) <= 1
             placed = replace(request, actors=recorded_actors(renderer, request.start_s))
             assert difference(renderer.render(placed), expected) <= 1
+
+
+def test_the_background_is_that_of_the_lane_that_the_vehicle_drives_in(
+    renderer: SceneRenderer, served: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = renderer.ego_trajectory()[1][:6]
+    # As if the second chunk led back, 3 m to the left.
+    positions = np.concatenate([out[:, :2, 3], (out[:, :2, 3] + 3.0 * out[:, :2, 1])[::-1]])
+    facings = np.concatenate([out[:, :2, 0], -out[::-1, :2, 0]])
+    layout = ChunkLayout((0, 1), (0, 6), (5, 11), np.arange(12.0), positions, facings)
+    monkeypatch.setattr(renderer, "_layout", layout)
+    request = request_at(renderer, served, 2, "front_camera")
+    pose = request.start_world_SE3_camera.copy()
+    pose[:3, 3] += 2.5 * out[2, :3, 1]
+
+    def find_background(camera: str | None) -> int:
+        asked = replace(request, start_world_SE3_camera=pose, end_world_SE3_camera=pose, camera=camera)
+        return renderer._find_scene(asked, pose, 2.0, request.start_s).chunk.index
+
+    assert find_background("front_camera") == 0
+    # A camera that is not of the rig may look anywhere: the nearest place counts.
+    assert find_background(None) == 1
 
 
 def test_a_batch_is_its_images_in_order(renderer: SceneRenderer, served: tuple[str, str]) -> None:
