@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,8 @@ from genre_tasks.errors import GenreError, ResourceError
 from genre_tasks.temporary_names import describe_owner
 from storage.io_errors import as_genre_error
 
+# Writing to a file that is open names no file in its error, and some libraries that write give no number either.
+_ERRORS_OF_OPEN_FILES = frozenset({None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 _REMEDY = "Free space, or name another --out in which this user may write; nothing is half-written."
 
 
@@ -29,8 +32,10 @@ def name_output(out: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        known = as_genre_error(error, out, option="--out")
-        is_of_output = _rename_hidden(known, out) or Path(str(known.file)) in (out, *out.parents)
+        known = as_genre_error(error, out, option=None)
+        is_hidden = _rename_hidden(known, out)
+        is_named = error.filename is not None or error.errno in _ERRORS_OF_OPEN_FILES
+        is_of_output = is_hidden or (is_named and Path(str(known.file)) in (out, *out.parents))
         # Of memory and file handles another folder has no more.
         if is_of_output and type(known) is not ResourceError:
             known.remedy = _REMEDY

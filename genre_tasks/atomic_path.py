@@ -55,8 +55,11 @@ def _name_target(error: OSError | GenreError, part: Path, path: Path) -> None:
     if isinstance(error, GenreError):
         if error.file == str(part):
             error.file = str(path)
-    elif str(error.filename) == str(part) or (error.filename is None and error.errno in _ERRORS_OF_OPEN_FILES):
-        error.filename = str(path)
+    elif str(part) in (str(error.filename), str(error.filename2)) or (
+        error.filename is None and error.errno in _ERRORS_OF_OPEN_FILES
+    ):
+        # A copy that fails names its source as well, which is not to blame.
+        error.filename, error.filename2 = str(path), None
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 
@@ -20,7 +21,10 @@ from flows.dataset.server_calls import call_server
 from flows.dataset.start_watch import StartWatch
 from flows.dataset.work_units import read_unit
 
+_log = logging.getLogger("genre")
 _POLL_S = 30.0
+# A log whose run is cancelled is given up, and one whose run is gone is submitted again.
+_WAY_OUT = "delete the run (prefect flow-run delete {id}): its log is submitted again."
 _ACTIVE = [StateType.SCHEDULED, StateType.PENDING, StateType.RUNNING, StateType.CANCELLING]
 
 
@@ -37,7 +41,7 @@ class ChildStartWatch:
     def __init__(self, client: SyncPrefectClient, clock: Callable[[], float] = time.monotonic) -> None:
         self._client = client
         self._clock = clock
-        self._watch = StartWatch(client, clock, subject="the oldest run of a log")
+        self._watch = StartWatch(client, clock, subject="the oldest run of a log", way_out=_WAY_OUT)
         self._next_s = clock()
 
     def check(self, runs: Sequence[FlowRun]) -> None:
@@ -46,10 +50,14 @@ class ChildStartWatch:
         Args:
             runs: the child runs that were active when they were last looked at, the oldest first.
         """
-        if runs and all(run.state is not None and run.state.type is StateType.SCHEDULED for run in runs):
-            self._watch.check(runs[0])
-        else:
+        if not runs or any(run.state is None or run.state.type is not StateType.SCHEDULED for run in runs):
             self._watch.restart()
+            return
+        # A server that does not tell of its queues is no reason to end a dataset.
+        try:
+            self._watch.check(runs[0])
+        except Exception as error:
+            _log.warning("why runs of logs do not start could not be asked: %s", error)
 
     def follow(self, parent: FlowRun) -> None:
         """Reads the child runs of a running parent now and then, and checks them.

@@ -110,9 +110,12 @@ def _check_parameters(in_flight: int, unit: str, attempts: int) -> None:
 def _reconstruct_on_pool(
     request: ChildRequest, units: Sequence[WorkUnit], limits: SupervisionLimits, table: LiveTable
 ) -> Outcomes:
-    # A parent that was deleted must not submit: another one may have taken its place.
-    runs = PrefectRuns(request, before_submission=partial(require_parent, request.parent))
-    return Supervisor(units, runs, limits, table.show, last_outage=read_last_outage).run()
+    # A parent that was deleted must not submit, nor write the record: another one may have taken its place.
+    check_parent = partial(require_parent, request.parent)
+    runs = PrefectRuns(request, before_submission=check_parent)
+    outcomes = Supervisor(units, runs, limits, table.show, last_outage=read_last_outage).run()
+    check_parent()
+    return outcomes
 
 
 def _reconstruct_here(

@@ -25,6 +25,7 @@ class StartWatch:
         client: of the server.
         clock: seconds of a clock that never jumps.
         subject: what a warning calls the flow run.
+        way_out: what helps a flow run that no worker will take, with ``{id}`` in the place of its id.
     """
 
     def __init__(
@@ -32,10 +33,12 @@ class StartWatch:
         client: SyncPrefectClient,
         clock: Callable[[], float] = time.monotonic,
         subject: str = "the dataset's flow run",
+        way_out: str = "cancel it (prefect flow-run cancel {id}), and run the same command again.",
     ) -> None:
         self._client = client
         self._clock = clock
         self._subject = subject
+        self._way_out = way_out
         self._state_id: UUID | None = None
         self._since_s = clock()
         self._last_reason = ""
@@ -67,7 +70,7 @@ class StartWatch:
             _log.warning("%s has not started: %s", self._subject, reason)
 
     def _find_reason(self, run: FlowRun) -> str:
-        again = f"cancel it (prefect flow-run cancel {run.id}), and run the same command again."
+        again = self._way_out.format(id=run.id)
         if run.state is not None and run.state.type is StateType.PENDING:
             return f"a worker has taken it, and starts no process. If that worker is dead, {again}"
         queue = self._read_queue(run)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from flows.simulation.run_scenes import RunScenes
 from genre_tasks.config import IngestConfig
 from genre_tasks.ego_paths.world_actors import WorldActor, list_parked_actors
-from genre_tasks.errors import InputError
+from genre_tasks.errors import ConfigError, InputError
 from genre_tasks.logs.types import CuboidTrack
 from genre_tasks.scene.actor_track import cut_track_to_chunk
 from genre_tasks.scene.chunk import Chunk
@@ -24,11 +24,11 @@ def find_tracks(recorded: RunScenes) -> tuple[CuboidTrack, ...] | None:
 
     Returns:
         The objects; ``None`` where the log is gone or another one, as for a store that was copied from another machine,
-        or its boxes cannot be read, without which the run went on too.
+        where this version refuses its URI, or where its boxes cannot be read, without which the run went on too.
     """
     try:
         return recorded.log.tracks()
-    except InputError:
+    except (InputError, ConfigError):
         return None
 
 

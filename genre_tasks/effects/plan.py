@@ -51,7 +51,7 @@ def plan_effects(
         One decision for each effect, and the parameters of those that are on.
 
     Raises:
-        ConfigError: an effect is set on that the log makes impossible, or another effect that is off.
+        ConfigError: an effect is set on that the log makes impossible.
     """
     # Measurements are shared: two effects that look at the same images decode them once.
     measurements = ChunkMeasurements(chunk, cameras)
@@ -101,13 +101,6 @@ def _decide(name: str, setting: str, measurements: ChunkMeasurements, decisions:
     unmet = _find_unmet(effect, decisions)
     # Where nothing calls for the effect, nothing is missed without the other one.
     if unmet is not None and choice == "on" and measurement.value:
-        if setting == "on":
-            raise ConfigError(
-                f"the effect {name} is set on, and {unmet}",
-                remedy=f"Set effects.{name} to auto or off, or effects.{effect.requires} to on.",
-                log=measurements.chunk.log,
-                chunk=measurements.chunk.index,
-            )
         choice, reason = "off", f"{unmet}; {reason}"
     return Decision(
         name=name,

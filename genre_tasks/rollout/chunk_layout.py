@@ -17,6 +17,9 @@ _NEAREST_FRAME = 0.49
 # A place that was recorded facing the other way counts as so much farther. Lanes of one street are nearer to each other
 # than that, and who turns around where there is no other lane stays there.
 _OTHER_WAY_M = 20.0
+# Cosine of the least angle at which a vehicle faces the other way. At a right angle, as where a path leaves the
+# recorded street, the nearest place is the right one.
+_OTHER_WAY_COS = -0.5
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,8 @@ class ChunkLayout:
         cost = distance + _M_PER_FRAME * np.abs(moments - frame)
         if facing is not None:
             # By where the vehicle faces, which standing and reversing do not change as they do the direction driven.
-            turned = self.facings @ facing < 0
+            lengths = np.linalg.norm(self.facings, axis=1) * np.linalg.norm(facing)
+            turned = self.facings @ facing < _OTHER_WAY_COS * lengths
             cost[np.append(turned[:-1] | turned[1:], turned)] += _OTHER_WAY_M
         return float(moments[cost.argmin()])
 

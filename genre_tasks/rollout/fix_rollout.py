@@ -126,8 +126,8 @@ class RolloutFixer:
         novel = self._render_inputs(images, chunk_images)
         novel, filled = self._paste_repaired(images, novel, chunk_images)
         color = self._run_network(images, novel, chunk_images, range(len(images.views)))
-        self._last.remember(images, color)
         depth = _fill_depth(images, novel, filled)
+        self._remember(images, color, depth, filled)
         return FixedRolloutImages(color, filled, torch.ones_like(images.alpha), depth)
 
     @torch.no_grad()
@@ -155,9 +155,14 @@ class RolloutFixer:
             # The network repairs a view in one piece, and only the uncovered pixels are taken.
             fixed = self._run_network(images, novel, chunk_images, rows)
             color[rows] = torch.where(filled[rows][..., None], fixed, color[rows])
-        self._last.remember(images, color)
         depth = _fill_depth(images, novel, filled)
+        self._remember(images, color, depth, filled)
         return FixedRolloutImages(color, filled, images.alpha.masked_fill(filled, 1.0), depth)
+
+    def _remember(self, images: RolloutImages, color: Tensor, depth: Tensor, filled: Tensor) -> None:
+        # With the depth of a hole, the next pose would find nothing of what was filled.
+        shown = replace(images, alpha=images.alpha.masked_fill(filled, 1.0), depth=depth)
+        self._last.remember(shown, color)
 
     def _load_chunk(self, images: RolloutImages) -> _ChunkImages:
         chunk = images.chunk_scene.chunk

@@ -73,7 +73,7 @@ def separate_removed_actors(
 
     Args:
         scene: as recorded.
-        removed: actors that an edit took away or moved, as recorded; their tracks may go on in other chunks.
+        removed: actors that an edit took away or moved, as recorded.
         sources: recorded images.
         views: those of the images, in the same order, without motion blur.
         settings: of the renderer.
@@ -81,10 +81,7 @@ def separate_removed_actors(
     Returns:
         The images without what the actors hide.
     """
-    tracks = {actor.track_id: actor for actor in removed}
-    actors = select_actors(scene, tracks)
-    # A pose may be of a moment that another chunk has recorded, and the tracks of the edit go on there.
-    actors = replace(actors, actors=tuple(tracks.get(actor.track_id, actor) for actor in actors.actors))
+    actors = select_actors(scene, {actor.track_id for actor in removed})
     hidden = []
     for source, view in zip(sources, views, strict=True):
         drawn = render_views(actors, [view], settings)
@@ -108,7 +105,10 @@ def find_uncovered_area(
     Returns:
         [C, H, W] true there; what the actors did not cover is not in it.
     """
-    drawn = render_views(removed.scene, images.views, settings)
+    first, last = images.chunk_scene.chunk.frames[0], images.chunk_scene.chunk.frames[-1]
+    # At moments of other chunks what this one's images lack is still where an actor was at the nearest of their frames.
+    views = [replace(view, frame=min(max(view.frame, first), last)) for view in images.views]
+    drawn = render_views(removed.scene, views, settings)
     # What is nearer than the actor was never hidden by it.
     covered = (drawn.alpha >= COVERED_ALPHA) & ((depth == 0) | (depth > drawn.expected_depth()))
     uncovered = torch.zeros_like(covered)

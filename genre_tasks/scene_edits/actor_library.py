@@ -98,7 +98,8 @@ def take_actor(source: SceneSource, survey: RunSurvey, track_id: str) -> Library
     chunk_scene = source.load(chunk_number)
     number = next(k for k, a in enumerate(chunk_scene.scene.actors) if a.track_id == track_id)
     node = chunk_scene.scene.actors[number]
-    part = extract_part(chunk_scene.scene, number)
+    # A run that is edited itself may show it with a shadow, which stays behind.
+    part = extract_part(chunk_scene.scene, number, chunk_scene.shadow_counts.get(track_id, 0))
     views = chunk_scene.chunk.views
     points = chunk_scene.chunk.actors[number].points
     return LibraryActor(

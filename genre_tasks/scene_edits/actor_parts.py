@@ -64,17 +64,19 @@ class PlacedActor:
     keeps_shape: bool = True
 
 
-def extract_part(scene: SceneGraph, number: int) -> ActorPart:
+def extract_part(scene: SceneGraph, number: int, shadow_count: int = 0) -> ActorPart:
     """Copies an actor out of a scene.
 
     Args:
         scene: any.
         number: of the actor in it.
+        shadow_count: how many of its Gaussians are a contact shadow, the last ones, which are left out.
 
     Returns:
         Its Gaussians, harmonics and deformation.
     """
     rows = torch.nonzero(scene.nodes == FIRST_ACTOR + number)[:, 0]
+    rows = rows[: len(rows) - shadow_count]
     harmonics = scene.spherical_harmonics
     return ActorPart(
         gaussians=map_attributes(lambda x: x.index_select(0, rows), scene.gaussians),

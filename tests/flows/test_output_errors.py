@@ -49,6 +49,12 @@ def test_an_error_of_a_file_names_the_one_that_was_asked_for(
     assert not list(tmp_path.iterdir())
 
 
+def test_an_error_of_a_copy_names_what_was_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="No space") as caught, atomic_path(tmp_path / "out.png") as part:
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "in.png"), None, str(part))
+    assert caught.value.filename == str(tmp_path / "out.png") and "in.png" not in str(caught.value)
+
+
 def test_an_error_of_another_file_stays(tmp_path: Path) -> None:
     for make_error in (refused, film_failed):
         with pytest.raises((OSError, GenreError)) as caught, atomic_path(tmp_path / "out.png"):
@@ -90,6 +96,13 @@ def test_an_error_of_what_is_read_meanwhile_names_that(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught, name_output(tmp_path / "deep" / "out"):
         raise refused(read)
     assert caught.value.file == str(read) and "nothing is half-written" not in caught.value.remedy
+    assert "--out" not in caught.value.remedy
+
+
+def test_an_error_of_no_file_is_not_blamed_on_the_output(tmp_path: Path) -> None:
+    with pytest.raises(GenreError) as caught, name_output(tmp_path / "out"):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+    assert "--out" not in caught.value.remedy and "Free space" not in caught.value.remedy
 
 
 def test_memory_that_runs_out_has_its_own_remedy(tmp_path: Path) -> None:

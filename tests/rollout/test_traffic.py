@@ -163,6 +163,16 @@ def test_who_turns_around_on_a_straight_street_stays_there() -> None:
     assert np.array_equal(*places) and np.allclose(places[0], np.array(x_m) / 2)
 
 
+def test_who_turns_off_the_street_is_at_the_nearest_place() -> None:
+    # At a right angle to the street, the jitter of recorded poses decides which of them look the other way.
+    jitter = np.deg2rad(np.where(np.arange(40) % 2, 2.0, -2.0))
+    positions = np.stack([np.arange(0.0, 80.0, 2.0), np.zeros(40)], 1)
+    facings = np.stack([np.cos(jitter), np.sin(jitter)], 1)
+    layout = ChunkLayout((0,), (0,), (39,), np.arange(40.0), positions, facings)
+    for facing in (-1.0, 1.0):
+        assert layout.find_place(np.array([22.0, 3.0]), 11.0, np.array([0.0, facing])) == pytest.approx(11.0)
+
+
 def test_fades_of_background_and_traffic() -> None:
     fade = Handover(before=0, after=1, border_frame=3.5, start_frame=4.0, end_frame=6.0)
     assert [fade.weigh(place) for place in (3, 4.5, 6)] == [0, 0.25, 1]

@@ -261,6 +261,18 @@ def test_contact_shadow_darkens_the_ground_alone(run: MadeRun) -> None:
     assert (means[:, :2].abs() <= torch.tensor(SIZE_M[:2]) * 0.6).all()
 
 
+def test_an_actor_of_an_edited_run_leaves_its_shadow_behind(run: MadeRun) -> None:
+    shaded = SimulateConfig(contact_shadow=0.9)
+    moved = edit(run, Move(actor="b", left_m=0.1), config=shaded)
+    counts = []
+    for source in ("", "moved"):
+        insert = Insert(actor="b", from_run=source or None, name="x", ahead_m=9, left_m=0, speed_m_s=0)
+        edited = edit(run, insert, config=shaded, moved=moved).load(0)
+        number = next(k for k, node in enumerate(edited.scene.actors) if node.track_id == "x")
+        counts.append(int((edited.scene.nodes == FIRST_ACTOR + number).sum()))
+    assert counts[0] == counts[1]
+
+
 def test_actor_of_a_darker_run_is_brightened(run: MadeRun) -> None:
     dark = MadeRun(road_srgb=0.4)
     edited = edit(run, Insert(actor="a", from_run="dark", name="x"), dark=dark).load(0)
