@@ -12,7 +12,7 @@ from genre_tasks.temporary_names import describe_owner
 from storage.io_errors import as_genre_error
 
 # Writing to a file that is open names no file in its error, and some libraries that write give no number either.
-_ERRORS_OF_OPEN_FILES = frozenset({None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+_ERRORS_OF_UNNAMED_FILES = frozenset({None, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 _REMEDY = "Free space, or name another --out in which this user may write; nothing is half-written."
 
 
@@ -34,8 +34,8 @@ def name_output(out: Path) -> Iterator[None]:
     except OSError as error:
         known = as_genre_error(error, out, option=None)
         is_hidden = _rename_hidden(known, out)
-        is_named = error.filename is not None or error.errno in _ERRORS_OF_OPEN_FILES
-        is_of_output = is_hidden or (is_named and Path(str(known.file)) in (out, *out.parents))
+        is_of_file = error.filename is not None or error.errno in _ERRORS_OF_UNNAMED_FILES
+        is_of_output = is_hidden or (is_of_file and Path(str(known.file)) in (out, *out.parents))
         # Of memory and file handles another folder has no more.
         if is_of_output and type(known) is not ResourceError:
             known.remedy = _REMEDY

@@ -34,7 +34,8 @@ from storage.code_digest import code_digest
 from storage.opening import open_store
 from storage.store import Artifact, Provenance
 
-_CODE = ("genre_tasks.scene_edits.edited_scenes", ("genre_tasks.scene_edits.stored_chunk",))
+_EDITS_MODULE = "genre_tasks.scene_edits.edited_scenes"
+_STORED_CHUNK_MODULE = "genre_tasks.scene_edits.stored_chunk"
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ def digest_edits(store: str, recorded: RunScenes, edits: EditList, config: Simul
         "inputs": recorded.payload_digests(),
         "runs": {name: RunScenes(store, name).record["run"] for name in runs},
         "contact_shadow": config.contact_shadow,
-        "code": code_digest(*_CODE),
+        "code": code_digest(_EDITS_MODULE, (_STORED_CHUNK_MODULE,)),
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
@@ -242,7 +243,7 @@ def _write_chunk(
         provenance = Provenance(
             inputs={name: keys[name]},
             configuration=edits.model_dump(mode="json"),
-            code_digest=code_digest(*_CODE),
+            code_digest=code_digest(_EDITS_MODULE, (_STORED_CHUNK_MODULE,)),
             seconds=usage.seconds,
             peak_mib=usage.peak_mib,
             environment=describe_environment(),

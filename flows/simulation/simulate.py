@@ -42,10 +42,10 @@ def simulate_run(request: SimulationRequest, progress: Progress = silent) -> dic
         The record: ``out``, ``key``, ``cached``, ``files``, ``seconds``, ``warnings`` and ``metrics``.
 
     Raises:
-        InputError: there is no such run, chunk, stage or camera, or a file is unfit.
+        InputError: there is no such run, chunk, stage or camera, a file is unfit, or the folder cannot be written to.
         ConfigError: the path is implausible or meets an actor, the folder holds another rollout, or another version
             wrote the record, with settings that this one does not know.
-        ResourceError: a film or another file could not be written.
+        ResourceError: a film could not be written, or the disk is full.
     """
     request.check()
     run = open_run(request.store, request.run, request.stage, request.chunks)
